@@ -1,0 +1,1 @@
+"""Reenact: facial expression retargeting between blendshape rigs."""

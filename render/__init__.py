@@ -1,0 +1,1 @@
+"""A differentiable mesh renderer for many deformed copies of one mesh, on the CPU."""
