@@ -35,7 +35,7 @@ class Rig:
     """Triangles, counter-clockwise from outside."""
     colors: Float[Tensor, "V 3"] | None = None
     """Vertex colours; a texture, where there is one, multiplies them."""
-    parts: Int[Tensor, "V"] | None = None  # noqa: UP037
+    parts: Int[Tensor, "V"] | None = None
     """Index into `PARTS` for each vertex, where known."""
     uv: Float[Tensor, "U 2"] | None = None
     """Texture coordinates, (0, 0) top left. U may exceed V: seams split uv, never geometry."""
@@ -74,7 +74,10 @@ class Rig:
         if self.uv is not None:
             uv_faces = self.faces if self.uv_faces is None else self.uv_faces
             if uv_faces.shape != self.faces.shape or int(uv_faces.max()) >= len(self.uv) or int(uv_faces.min()) < 0:
-                raise ReenactError(f"{self.name}: uv faces do not match the {len(self.faces)} faces and {len(self.uv)} uv")
+                raise ReenactError(
+                    f"{self.name}: uv faces do not match the {len(self.faces)} faces and {len(self.uv)} uv; "
+                    "export the mesh with its uv map again"
+                )
 
     def vertices(self, weights: Float[Tensor, "*batch K"]) -> Float[Tensor, "*batch V 3"]:
         """The expression that the weights make: neutral + sum of weighted deltas. Source: KI21, Eq. 1."""
@@ -90,7 +93,7 @@ class Rig:
         moved = {key: value.to(device) for key, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, **moved)
 
-    def part(self, *names: str) -> Int[Tensor, "N"]:  # noqa: UP037
+    def part(self, *names: str) -> Int[Tensor, "N"]:
         """Indices of the vertices whose part is one of the names; empty where parts are unknown."""
         if self.parts is None:
             return torch.zeros(0, dtype=torch.int64)

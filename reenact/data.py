@@ -1,0 +1,102 @@
+"""Studio: expressions of one rig, rendered to the pictures that the networks see."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from reenact.losses import VertexDistance, motion_weight
+from reenact.portrait import Portrait
+from reenact.rigs import motion
+from reenact.rigs.clip import Clip
+from reenact.rigs.rig import Rig
+
+_SURVEY = 256
+"""Random expressions from which a studio learns how the rig typically moves."""
+
+
+class Studio:
+    """Photographs one rig, in the shared layout, as residuals against its neutral."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        resolution: int,
+        residual: bool = True,
+        layout: Float[Tensor, "R R 2"] | None = None,
+        clip: Clip | None = None,
+        fixed_frames: int | None = None,
+        seed: int = 0,
+    ):
+        """
+        Args:
+            rig: Photographed by `Portrait.of`.
+            resolution: Pixels along each side.
+            residual: Networks see the difference from the neutral picture; else the picture itself.
+            layout: Sampling grid in [-1, 1] (x, y) that warps each picture onto the shared layout; None leaves it.
+            clip: Training motion with the rig's names; None samples random valid expressions without end.
+            fixed_frames: Draw only this many expressions, once.
+            seed: Of the survey and of the fixed expressions.
+        """
+        self.rig, self.resolution, self.residual, self.layout = rig, resolution, residual, layout
+        self.portrait = Portrait.of(rig)
+        self.pool = None if clip is None else clip.weights
+        if fixed_frames is not None:
+            self.pool = self.draw(fixed_frames, np.random.default_rng([seed, 1]))
+        self.neutral = self.photograph(torch.zeros(1, len(rig.names)))[0]  # (3, R, R)
+        survey = self.draw(_SURVEY, np.random.default_rng([seed, 2]))
+        self.mean_weights = survey.mean(0)
+        self.motion = motion_weight(self.photograph(survey) - self.neutral)
+        self.vertex_distance = VertexDistance(rig, survey)
+
+    def draw(self, count: int, random: np.random.Generator) -> Float[Tensor, "N K"]:
+        """Weights of training expressions: from the clip or the fixed set if there is one, else fresh."""
+        if self.pool is None:
+            return motion.expressions(self.rig.names, count, random)
+        return self.pool[random.integers(len(self.pool), size=count)]
+
+    def photograph(
+        self, weights: Float[Tensor, "N K"], buffers: tuple[str, ...] = ("color",)
+    ) -> Float[Tensor, "N C R R"]:
+        """Pictures in [0, 1] in the shared layout, the named buffers stacked along channels. Differentiable."""
+        rendered = self.portrait.render(self.rig.vertices(weights), self.resolution, buffers)
+        picture = torch.cat([rendered[name] for name in buffers], dim=1)
+        return picture if self.layout is None else warp(picture, self.layout)
+
+    def show(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
+        """What a network sees of pictures: residuals, or the pictures themselves."""
+        return pictures - self.neutral if self.residual else pictures
+
+    def picture(self, shown: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
+        """The pictures in [0, 1] behind what a network drew: the inverse of `show`, clamped."""
+        return (shown + self.neutral if self.residual else shown).clamp(0, 1)
+
+
+def warp(pictures: Float[Tensor, "N C H W"], grid: Float[Tensor, "H W 2"]) -> Float[Tensor, "N C H W"]:
+    """Pictures resampled at the grid's positions, (x, y) in [-1, 1] with -1 the outer edge of the first pixel."""
+    return F.grid_sample(
+        pictures, grid.expand(len(pictures), -1, -1, -1), mode="bilinear", padding_mode="border", align_corners=False
+    )
+
+
+def identity_grid(resolution: int) -> Float[Tensor, "R R 2"]:
+    """The grid that changes nothing: centres of the pixels."""
+    centres = (torch.arange(resolution, dtype=torch.float32) + 0.5) * (2 / resolution) - 1
+    y, x = torch.meshgrid(centres, centres, indexing="ij")
+    return torch.stack([x, y], dim=-1)
+
+
+def jitter(pictures: Float[Tensor, "N C R R"], elastic: float, random: torch.Generator) -> Float[Tensor, "N C R R"]:
+    """Each picture bent by its own smooth random displacement, so that the encoder cannot rely on exact places.
+
+    Args:
+        elastic: Standard deviation of a 4 x 4 grid of displacements, in halves of the picture's width.
+    """
+    count, resolution = len(pictures), pictures.shape[-1]
+    coarse = elastic * torch.randn(count, 2, 4, 4, generator=random)
+    fine = F.interpolate(coarse, size=(resolution, resolution), mode="bicubic", align_corners=True)
+    grid = identity_grid(resolution) + fine.permute(0, 2, 3, 1)
+    return F.grid_sample(pictures, grid, mode="bilinear", padding_mode="border", align_corners=False)

@@ -1,0 +1,98 @@
+"""ImageRetargeter: a trained run as a `Retargeter`, clip to clip through pictures.
+
+Kim et al. 2021 (KI21), section 3: render the source, redraw it as the target with ReenactNet, read the weights with
+BPNet.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from reenact.config import Config
+from reenact.data import Studio
+from reenact.errors import ReenactError
+from reenact.models import Networks
+from reenact.rigs.clip import Clip
+from reenact.run import Run
+
+_CHUNK = 64
+"""Frames that are in memory as pictures at once."""
+
+
+class ImageRetargeter:
+    """Moves motion from `source` to `target` through a shared picture space."""
+
+    def __init__(self, config: Config, source: Studio, target: Studio, networks: Networks, target_key: str):
+        """`source` and `target` must be studios of the run that trained the networks; see `load`."""
+        self.config = config
+        self.source, self.target = source.rig, target.rig
+        self.source_studio, self.target_studio = source, target
+        self._draw = lambda shown: networks.reenactnet(shown, target_key)
+        self._read = networks.bpnets[target_key]
+
+    @classmethod
+    def load(cls, folder: Path, reverse: bool = False) -> ImageRetargeter:
+        """The retargeter that a run trained; `reverse` goes from its target to its source.
+
+        Raises:
+            FileNotFoundError: There is no run, or nothing was saved yet.
+        """
+        run = Run.open(folder)
+        networks = run.trained_networks()
+        source, target = run.keys[:2][::-1] if reverse else run.keys[:2]
+        return cls(run.config, run.studio(source), run.studio(target), networks, target)
+
+    @torch.inference_mode()
+    def __call__(self, clip: Clip) -> Clip:
+        """The clip on the target, weights in [0, 1].
+
+        Raises:
+            ReenactError: The clip's names are not the source's; `reenact.rigs.files.load_clip` puts them in order.
+        """
+        if clip.names != self.source.names:
+            raise ReenactError(
+                f"clip: expected the {len(self.source.names)} names of {self.source.name} in their order"
+            )
+        weights = [self.read(self.reenact(self.source_pictures(chunk))) for chunk in clip.weights.split(_CHUNK)]
+        return Clip(self.target.names, torch.cat(weights), clip.fps)
+
+    def step(self, weights: Float[Tensor, "Ks"]) -> Float[Tensor, "Kt"]:
+        """One frame; the same result as in a clip."""
+        with torch.inference_mode():
+            return self.read(self.reenact(self.source_pictures(weights[None])))[0]
+
+    def source_pictures(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N 3 R R"]:
+        """The source as the networks see it, before its neutral is subtracted."""
+        return self.source_studio.photograph(weights)
+
+    def target_pictures(self, weights: Float[Tensor, "N Kt"]) -> Float[Tensor, "N 3 R R"]:
+        """The target in the shared layout."""
+        return self.target_studio.photograph(weights)
+
+    def source_masks(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N 1 R R"]:
+        """Coverage of the source's pictures."""
+        return self.source_studio.photograph(weights, ("mask",))
+
+    def target_masks(self, weights: Float[Tensor, "N Kt"]) -> Float[Tensor, "N 1 R R"]:
+        """Coverage of the target's pictures in the shared layout."""
+        return self.target_studio.photograph(weights, ("mask",))
+
+    @torch.inference_mode()
+    def reenact(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
+        """Pictures of the source redrawn as the target, in the shared layout, in [0, 1]."""
+        drawn = self._draw(self.source_studio.show(pictures))
+        return drawn + self.target_studio.neutral if self.target_studio.residual else drawn
+
+    @torch.inference_mode()
+    def read(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N Kt"]:
+        """Weights of the target that make the pictures, clamped to [0, 1]."""
+        return self._read(self.target_studio.show(pictures)).clamp(0, 1)
+
+    @torch.inference_mode()
+    def read_direct(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N Kt"]:
+        """Weights read from the source's own pictures by the target's BPNet: what ReenactNet has to beat."""
+        return self._read(self.source_studio.show(pictures)).clamp(0, 1)

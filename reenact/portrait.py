@@ -1,0 +1,148 @@
+"""Portrait: the camera, light and framing that photograph a rig.
+
+Kim et al. 2021 (KI21) render every rig with 19 numbers: a 3 x 4 camera matrix, the model's position (3) and scale (1),
+and the position of a point light (3). Camera and light are the same for all rigs; position and scale put each rig's eye
+line and mouth line on the same rows of the picture, the only alignment that the published method has.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from reenact.errors import ReenactError
+from reenact.rigs import arkit
+from reenact.rigs.rig import Rig
+from render import Camera, Light, render
+
+EYE_HEIGHT = 0.40
+"""Height of the eye line above the middle of the picture, in halves of its height."""
+MOUTH_HEIGHT = -0.22
+"""Height of the mouth line; a wide open jaw still ends inside the picture."""
+CAMERA_DISTANCE = 0.60
+"""Metres from the camera to the plane of the face."""
+HALF_HEIGHT = 0.112
+"""Half the height of the picture at the plane of the face, in metres: an adult fills it at scale 1."""
+BACKGROUND = (0.36, 0.38, 0.41)
+"""sRGB behind the head."""
+
+_LID_SHAPES = ("eyeBlinkLeft", "eyeBlinkRight")
+_MOUTH_SHAPES = ("mouthPucker", "mouthFunnel", "mouthClose", "mouthSmileLeft", "mouthSmileRight")
+
+
+@dataclass(frozen=True)
+class Portrait:
+    """How one rig is photographed."""
+
+    rig: Rig
+    camera: Camera
+    light: Light
+    position: Float[Tensor, "3"]
+    """Added to the scaled vertices, metres."""
+    scale: float
+    """Multiplies the vertices."""
+
+    @classmethod
+    def of(cls, rig: Rig) -> Portrait:
+        """The portrait in which the rig's eyes and mouth lie on the rows that all rigs share.
+
+        Raises:
+            ReenactError: The rig's eyes and mouth cannot be told apart.
+        """
+        eyes, mouth = face_lines(rig)
+        span = float(eyes[1] - mouth[1])
+        if not span > 0:
+            raise ReenactError(f"{rig.name}: expected the eyes above the mouth (+Y up), got the reverse; turn the mesh")
+        scale = (EYE_HEIGHT - MOUTH_HEIGHT) * HALF_HEIGHT / span
+        middle = (eyes + mouth) / 2
+        anchor = torch.stack([middle[0], eyes[1], middle[2]])
+        position = torch.tensor([0.0, EYE_HEIGHT * HALF_HEIGHT, 0.0]) - scale * anchor
+        world_to_camera = torch.eye(4)[:3].clone()
+        world_to_camera[2, 3] = -CAMERA_DISTANCE
+        light = Light(position=torch.tensor([0.15, 0.35, 0.55]))
+        return cls(rig, Camera(world_to_camera, CAMERA_DISTANCE / HALF_HEIGHT), light, position, scale)
+
+    @property
+    def parameters(self) -> Float[Tensor, "19"]:
+        """Camera matrix (12), model position (3), model scale (1), light position (3). Source: KI21, section 3."""
+        scale = torch.tensor([self.scale])
+        return torch.cat([self.camera.world_to_camera.flatten(), self.position, scale, self.light.position])
+
+    def render(
+        self, vertices: Float[Tensor, "B V 3"], resolution: int, buffers: tuple[str, ...] = ("color",)
+    ) -> dict[str, Tensor]:
+        """Square pictures of expressions of the rig.
+
+        Args:
+            vertices: In the rig's own frame, metres.
+            resolution: Height and width in pixels.
+            buffers: Any of "color", "mask", "normals", "depth", "parts"; see `render.render`.
+
+        Returns:
+            Buffer name to (B, C, resolution, resolution).
+        """
+        rig = self.rig
+        return render(
+            self.scale * vertices + self.position,
+            rig.faces,
+            self.camera,
+            self.light,
+            height=resolution,
+            width=resolution,
+            colors=rig.colors,
+            texture=rig.texture,
+            uv=rig.uv,
+            uv_faces=rig.uv_faces,
+            parts=rig.parts,
+            background=BACKGROUND,
+            buffers=buffers,
+        )
+
+    def project(self, vertices: Float[Tensor, "*batch V 3"], resolution: int) -> Float[Tensor, "*batch V 2"]:
+        """Pixel coordinates (x, y) of vertices; (0, 0) is the top left corner of the top left pixel."""
+        world = self.scale * vertices + self.position
+        matrix = self.camera.world_to_camera
+        seen = world @ matrix[:, :3].T + matrix[:, 3]
+        on_plane = seen[..., :2] / -seen[..., 2:] * self.camera.focal
+        return torch.stack([1 + on_plane[..., 0], 1 - on_plane[..., 1]], dim=-1) * (resolution / 2)
+
+
+def face_lines(rig: Rig) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Middle of the eyes and middle of the mouth of the neutral, in the rig's frame.
+
+    From the part labels where the rig has them; else from what blink and mouth shapes move, where names tell them; else
+    from what any shapes move: motion lies in two heights, around the eyes and around the mouth.
+    """
+    if len(rig.part("eyes")) and len(rig.part("lips")):
+        return _box_middle(rig, rig.part("eyes")), _box_middle(rig, rig.part("lips"))
+    motion = rig.deltas.norm(dim=-1)  # (K, V)
+    known = [arkit.canonical(name) for name in rig.names]
+    lids = [k for k, name in enumerate(known) if name in _LID_SHAPES]
+    mouth = [k for k, name in enumerate(known) if name in _MOUTH_SHAPES]
+    if lids and mouth:
+        return _motion_middle(rig, motion[lids].sum(0)), _motion_middle(rig, motion[mouth].sum(0))
+    heights = (motion * rig.neutral[:, 1]).sum(1) / motion.sum(1).clamp_min(1e-12)  # (K,)
+    moving = motion.sum(1) > 1e-12
+    if int(moving.sum()) < 2:
+        raise ReenactError(
+            f"{rig.name}: expected blendshapes that move eyes and mouth, got {int(moving.sum())} that move anything; "
+            "check that the export kept the deltas"
+        )
+    ordered = heights[moving].sort().values
+    border = ordered[:-1] + ordered.diff() / 2
+    split = border[ordered.diff().argmax()]
+    upper, lower = moving & (heights > split), moving & (heights <= split)
+    return _motion_middle(rig, motion[upper].sum(0)), _motion_middle(rig, motion[lower].sum(0))
+
+
+def _box_middle(rig: Rig, vertices: Tensor) -> Tensor:
+    """Middle of the bounding box: unlike the mean it does not follow where a sculptor put more vertices."""
+    box = rig.neutral[vertices]
+    return (box.amin(0) + box.amax(0)) / 2
+
+
+def _motion_middle(rig: Rig, motion: Tensor) -> Tensor:
+    return (motion[:, None] * rig.neutral).sum(0) / motion.sum()

@@ -1,0 +1,361 @@
+"""train(): the one loop, for ReenactNet and for each rig's BPNet.
+
+Kim et al. 2021 (KI21), sections 3.2 and 3.3. Training goes through stages: ReenactNet first, then one BPNet per rig, so
+that each BPNet can learn from pictures as ReenactNet draws them. Every random number of a step comes from (seed, stage,
+step): the position in the data is the step, and a resumed run takes the same next step as an unbroken one.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from kornia.filters import gaussian_blur2d
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor
+
+from reenact.checkpoint import RunLock, flatten_optimizer, load_checkpoint, restore_optimizer, save_checkpoint
+from reenact.config import Config
+from reenact.data import Studio, jitter
+from reenact.losses import picture_distance, weight_distance
+from reenact.models import Networks
+from reenact.preview import save_preview
+from reenact.run import Run, networks_state
+
+_LOG_EVERY = 20
+"""Steps between lines of metrics.jsonl; each holds the mean since the last."""
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """One network's share of the training."""
+
+    name: str
+    """`reenactnet`, or `bpnet.KEY`."""
+    network: torch.nn.Module
+    steps: int
+    learning_rate: float
+    losses: Callable[[np.random.Generator, torch.Generator], dict[str, Tensor]]
+    """Terms whose sum is minimised, on a batch drawn with the given random numbers."""
+
+
+def train(config: Config, resume: bool = False) -> Path:
+    """Train the networks of a pair of rigs, or go on with a run that stopped.
+
+    Args:
+        config: All settings; when resuming, only `run` is read, the rest comes from the run's own config.
+        resume: Go on with the run in `config.run`; a finished run returns at once.
+
+    Returns:
+        The run folder.
+
+    Raises:
+        ReenactError: The folder exists and `resume` is False, another process trains in it, a rig cannot work.
+        KeyboardInterrupt: Ctrl-C; everything up to the last finished step was saved.
+    """
+    console = Console()
+    with console.status("Reading rigs, finding the layout"):
+        run = Run.open(Path(config.run or "")) if resume else Run.create(config)
+    config = run.config
+    with RunLock(run.folder), _interrupts() as interrupted:
+        torch.set_num_threads(config.training.threads or torch.get_num_threads())
+        with console.status("Photographing neutrals"):
+            studios = {key: run.studio(key) for key in run.keys}
+        networks = run.networks()
+        stages = _stages(config, studios, networks)
+        stage_index, first, optimizer = _restore(run, networks, stages) if resume else (0, 0, None)
+        done = sum(stage.steps for stage in stages[:stage_index])
+        with _progress(console) as show:
+            for index, stage in list(enumerate(stages))[stage_index:]:
+                optimizer = optimizer or _optimizer(config, stage)
+                log = _Log(run.folder / "metrics.jsonl", stage.name, first)
+                networks.train()
+                for step in range(first, stage.steps):
+                    seed = [config.training.seed, index, step]
+                    for group in optimizer.param_groups:
+                        group["lr"] = learning_rate(step, stage.steps, stage.learning_rate, config.training.schedule)
+                    losses = stage.losses(np.random.default_rng(seed), _torch_random(seed))
+                    loss = torch.stack(list(losses.values())).sum()
+                    if not torch.isfinite(loss):
+                        raise FloatingPointError(
+                            f"{run.folder}: the loss of {stage.name} became {loss.item()} at step {step}; "
+                            "the last checkpoint is intact, lower the learning rate and train again"
+                        )
+                    optimizer.zero_grad(set_to_none=True)
+                    loss.backward()
+                    optimizer.step()
+                    log.add(step, losses)
+                    show(stage.name, step + 1, stage.steps, log.recent)
+                    last = step + 1 == stage.steps
+                    if last or (step + 1) % config.training.save_every == 0 or interrupted():
+                        log.flush()
+                        _save(run, networks, optimizer, index, step + 1, done + step + 1)
+                        _preview(run, networks, studios, index, done + step + 1, console)
+                    if interrupted():
+                        console.print(f"Stopped and saved. Go on with: reenact train --run {run.folder} --resume")
+                        raise interrupted()
+                done, first, optimizer = done + stage.steps, 0, None
+    _say_next(console, run)
+    return run.folder
+
+
+def learning_rate(step: int, steps: int, peak: float, schedule: str) -> float:
+    """The rate at a step: constant, or one cycle (cosine up over the first 15 %, cosine down to nothing)."""
+    if schedule == "constant":
+        return peak
+    warm = 0.15 * steps
+    if step < warm:
+        return peak * (0.04 + 0.96 * (1 - math.cos(math.pi * step / warm)) / 2)
+    return peak * (1e-4 + (1 - 1e-4) * (1 + math.cos(math.pi * (step - warm) / (steps - warm))) / 2)
+
+
+def _stages(config: Config, studios: dict[str, Studio], networks: Networks) -> list[_Stage]:
+    training, bpnet = config.training, config.bpnet
+    steps = _step_count(training.steps, training.epochs, training.fixed_frames, training.batch_size)
+    stages = [
+        _Stage(
+            "reenactnet",
+            networks.reenactnet,
+            steps,
+            training.learning_rate,
+            lambda random, noise: _reenactnet_losses(config, studios, networks, random, noise),
+        )
+    ]
+    steps = _step_count(bpnet.steps, bpnet.epochs, training.fixed_frames, bpnet.batch_size)
+    for key, studio in studios.items():
+        stages.append(
+            _Stage(
+                f"bpnet.{key}",
+                networks.bpnets[key],
+                steps,
+                bpnet.learning_rate,
+                lambda random, noise, key=key, studio=studio: _bpnet_losses(
+                    config, studio, networks, key, random, noise
+                ),
+            )
+        )
+    return stages
+
+
+def _reenactnet_losses(
+    config: Config,
+    studios: dict[str, Studio],
+    networks: Networks,
+    random: np.random.Generator,
+    noise: torch.Generator,
+) -> dict[str, Tensor]:
+    """Each rig redraws itself through the shared encoder. Source: KI21, L_recon.
+
+    Ours: residuals against the neutral, jitter of the encoder's input only, weighting by motion.
+    """
+    count = config.training.batch_size
+    with torch.no_grad():
+        shown = {key: studio.show(studio.photograph(studio.draw(count, random))) for key, studio in studios.items()}
+        seen = torch.cat(list(shown.values()))
+        if config.training.elastic:
+            seen = jitter(seen, config.training.elastic, noise)
+    codes = networks.reenactnet.encode(seen).split(count)
+    losses = {}
+    for (key, studio), code in zip(studios.items(), codes):
+        weight = studio.motion if config.training.motion_weighting else None
+        losses[f"reconstruction.{key}"] = picture_distance(networks.reenactnet.decoders[key](code), shown[key], weight)
+    return losses
+
+
+def _bpnet_losses(
+    config: Config,
+    studio: Studio,
+    networks: Networks,
+    key: str,
+    random: np.random.Generator,
+    noise: torch.Generator,
+) -> dict[str, Tensor]:
+    """Weights are read back from pictures of the rig's own expressions. Source: KI21, L_b = L_w + L_r.
+
+    Ours: part of the pictures passes through ReenactNet first and all are slightly blurred and noisy; errors also count
+    by how far they move the vertices.
+    """
+    bpnet = config.bpnet
+    with torch.no_grad():
+        weights = studio.draw(bpnet.batch_size, random)
+        pictures = studio.photograph(weights)
+        shown = studio.show(pictures)
+        decoded = round(bpnet.decoded_fraction * len(shown))
+        if decoded:
+            jittered = jitter(shown[:decoded], config.training.elastic, noise)
+            shown = torch.cat([networks.reenactnet(jittered, key), shown[decoded:]])
+            sigma = float(random.uniform(0.1, 0.8))
+            shown = gaussian_blur2d(shown, (5, 5), (sigma, sigma))
+            shown = shown + 0.01 * torch.randn(shown.shape, generator=noise)
+    predicted = networks.bpnets[key](shown)
+    losses = {}
+    if bpnet.weight_loss:
+        losses["weights"] = bpnet.weight_loss * weight_distance(predicted, weights)
+    if bpnet.vertex_loss:
+        losses["vertices"] = bpnet.vertex_loss * studio.vertex_distance(predicted, weights)
+    if bpnet.image_loss:
+        losses["image"] = bpnet.image_loss * picture_distance(studio.photograph(predicted), pictures)
+    return losses
+
+
+def _step_count(steps: int, epochs: float | None, frames: int | None, batch_size: int) -> int:
+    """Steps, or as many as make the epochs over a fixed set."""
+    if epochs is None or frames is None:
+        return steps
+    return math.ceil(epochs * frames / batch_size)
+
+
+def _optimizer(config: Config, stage: _Stage) -> torch.optim.Optimizer:
+    if config.training.optimizer == "adam":
+        return torch.optim.Adam(stage.network.parameters(), lr=stage.learning_rate)
+    return torch.optim.AdamW(
+        stage.network.parameters(), lr=stage.learning_rate, weight_decay=config.training.weight_decay
+    )
+
+
+def _torch_random(seed: list[int]) -> torch.Generator:
+    return torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] >> 1))
+
+
+def _save(run: Run, networks: Networks, optimizer: torch.optim.Optimizer, stage: int, step: int, total: int) -> None:
+    """`stage` and `step` are where to go on; `total` counts steps over all stages and names the checkpoint."""
+    tensors = {f"networks.{name}": tensor for name, tensor in networks.state_dict().items()}
+    optimizer_tensors, optimizer_state = flatten_optimizer(optimizer)
+    tensors |= {f"optimizer.{name}": tensor for name, tensor in optimizer_tensors.items()}
+    state = {"stage": stage, "step": step, "optimizer": optimizer_state}
+    save_checkpoint(run.folder, total, tensors, state, keep=run.config.training.keep)
+
+
+def _restore(run: Run, networks: Networks, stages: list[_Stage]) -> tuple[int, int, torch.optim.Optimizer | None]:
+    """Networks as they were saved; the stage and step to go on with, and that stage's optimizer if it had begun."""
+    try:
+        checkpoint = load_checkpoint(run.folder)
+    except FileNotFoundError:  # stopped before the first save: nothing to restore
+        return 0, 0, None
+    networks.load_state_dict(networks_state(checkpoint.tensors))
+    stage, step = checkpoint.state["stage"], checkpoint.state["step"]
+    if step >= stages[stage].steps:
+        return stage + 1, 0, None
+    optimizer = _optimizer(run.config, stages[stage])
+    prefix = "optimizer."
+    tensors = {name[len(prefix) :]: t for name, t in checkpoint.tensors.items() if name.startswith(prefix)}
+    restore_optimizer(optimizer, tensors, checkpoint.state["optimizer"])
+    return stage, step, optimizer
+
+
+class _Log:
+    """Means of the losses, appended to a JSONL file; lines of steps that will be taken again are dropped first."""
+
+    def __init__(self, path: Path, stage: str, step: int):
+        self.path, self.stage = path, stage
+        self.pending: dict[str, list[float]] = {}
+        self.recent: dict[str, float] = {}
+        self.started, self.last = time.perf_counter(), step
+        if path.exists():
+            lines = [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
+            kept = [line for line in lines if line["stage"] != stage or line["step"] <= step]
+            path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+
+    def add(self, step: int, losses: dict[str, Tensor]) -> None:
+        for name, value in losses.items():
+            self.pending.setdefault(name, []).append(float(value.detach()))
+        self.step = step + 1
+        if self.step - self.last >= _LOG_EVERY:
+            self.flush()
+
+    def flush(self) -> None:
+        if not self.pending:
+            return
+        now = time.perf_counter()
+        self.recent = {name: float(np.mean(values)) for name, values in self.pending.items()}
+        speed = (self.step - self.last) / (now - self.started)
+        line = {
+            "stage": self.stage,
+            "step": self.step,
+            "loss": sum(self.recent.values()),
+            **self.recent,
+            "steps_per_second": speed,
+        }
+        with self.path.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        self.pending, self.started, self.last = {}, now, self.step
+
+
+def _preview(
+    run: Run, networks: Networks, studios: dict[str, Studio], stage: int, total: int, console: Console
+) -> None:
+    """A failing preview never stops training."""
+    try:
+        trained = [key for index, key in enumerate(studios) if index + 1 <= stage]
+        networks.eval()
+        save_preview(run.folder / "previews" / f"{total:06d}.png", studios, networks, trained)
+    except Exception as error:
+        console.print(f"preview skipped: {error}")
+    finally:
+        networks.train()
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Callable[[str, int, int, dict[str, float]], None]]:
+    """A live line on a terminal; a line every few hundred steps elsewhere."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total} {task.fields[speed]} {task.fields[losses]}"),
+        TimeRemainingColumn(),
+    )
+    progress, tasks, started = Progress(*columns, console=console), {}, {}
+
+    def show(stage: str, step: int, steps: int, losses: dict[str, float]) -> None:
+        if stage not in tasks:
+            tasks[stage] = progress.add_task(stage, total=steps, completed=step - 1, speed="", losses="")
+            started[stage] = (time.perf_counter(), step - 1)
+        begun, first = started[stage]
+        speed = f"{(step - first) / (time.perf_counter() - begun):.1f} steps/s"
+        text = " ".join(f"{name.split('.')[0]} {value:.4f}" for name, value in losses.items())
+        progress.update(tasks[stage], completed=step, speed=speed, losses=text)
+        if not console.is_terminal and (step % 200 == 0 or step == steps):
+            left = (steps - step) * (time.perf_counter() - begun) / (step - first)
+            console.print(f"{stage} {step}/{steps}  {speed}  {left:.0f} s left  {text}")
+
+    if console.is_terminal:
+        with progress:
+            yield show
+    else:
+        yield show
+
+
+@contextmanager
+def _interrupts() -> Iterator[Callable[[], BaseException | None]]:
+    """Ctrl-C and SIGTERM ask for a save after the current step; a second Ctrl-C stops at once."""
+    asked: list[BaseException] = []
+
+    def ask(number: int, _frame: object) -> None:
+        if asked:
+            raise KeyboardInterrupt
+        asked.append(KeyboardInterrupt() if number == signal.SIGINT else SystemExit(143))
+
+    try:
+        previous = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # not the main thread: signals are somebody else's
+        previous = {}
+    try:
+        yield lambda: asked[0] if asked else None
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _say_next(console: Console, run: Run) -> None:
+    console.print(f"Trained: {run.folder}")
+    console.print(f"  reenact infer {run.folder} CLIP --out result.glb")
+    console.print(f"  reenact evaluate {run.folder}")
