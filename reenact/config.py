@@ -1,9 +1,19 @@
-"""Every setting of a training run, with its default."""
+"""Every setting of a training run, with its default; strict reading and writing of TOML."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+import difflib
+import json
+import math
+import tomllib
+import types
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from reenact.atomic import write_atomically
+from reenact.errors import ReenactError
 
 
 @dataclass(frozen=True)
@@ -129,3 +139,206 @@ class Config:
     reenactnet: ReenactNetConfig = field(default_factory=ReenactNetConfig)
     bpnet: BPNetConfig = field(default_factory=BPNetConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
+
+
+def load_config(path: Path | str) -> Config:
+    """The settings in a TOML file; keys that it leaves out have their defaults.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ReenactError: Not TOML, an unknown key, a value of the wrong type or out of range.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: there is no such settings file; see configs/ for examples")
+    try:
+        table = tomllib.loads(path.read_bytes().decode())
+    except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, numbers of thousands of digits
+        raise ReenactError(
+            f"{path}: expected TOML, got something else ({error}); compare with the files in configs/"
+        ) from error
+    config = config_from_dict(table, origin=str(path))
+    check_config(config, origin=str(path))
+    return config
+
+
+def save_config(config: Config, path: Path | str) -> None:
+    """Write every setting with its value, so that it can be read back whatever the defaults become."""
+    write_atomically(path, "\n".join(_toml_lines(config)).encode())
+
+
+def config_to_dict(config: Config) -> dict[str, Any]:
+    """The settings as nested dictionaries of plain values, ready for JSON."""
+    return asdict(config)
+
+
+def config_from_dict(table: dict[str, Any], origin: str = "settings") -> Config:
+    """The inverse of `config_to_dict`, as strict as `load_config`, but for the ranges (see `check_config`).
+
+    Args:
+        table: Sections and keys; what it leaves out has its default.
+        origin: Name of the file or place, to begin messages with.
+
+    Raises:
+        ReenactError: An unknown key or a value of the wrong type.
+    """
+    return _build(Config, table, origin, prefix="")
+
+
+def check_config(config: Config, origin: str = "settings") -> None:
+    """Refuse values that cannot work, before any work is done.
+
+    Raises:
+        ReenactError: Names the setting, what it allows and its value.
+    """
+    for key, value in _leaves(config):
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ReenactError(f"{origin}: {key}: expected a finite number, got {value}")
+        if isinstance(value, str) and not (value and _is_unicode(value)):
+            raise ReenactError(f"{origin}: {key}: expected a name or path in Unicode, got {value!r}")
+        allowed = _ALLOWED.get(key)
+        if allowed is not None and value is not None and not allowed[1](value):
+            raise ReenactError(f"{origin}: {key}: expected {allowed[0]}, got {value}")
+    for section, epochs in (("training", config.training.epochs), ("bpnet", config.bpnet.epochs)):
+        if epochs is not None and config.training.fixed_frames is None:
+            raise ReenactError(
+                f"{origin}: {section}.epochs: expected training.fixed_frames beside it, got none; "
+                f"epochs are passes over a fixed set, set how many pictures it has"
+            )
+    if config.bpnet.weight_loss == config.bpnet.image_loss == config.bpnet.vertex_loss == 0:
+        raise ReenactError(
+            f"{origin}: bpnet: expected a loss above 0, got weight_loss, image_loss and vertex_loss of 0"
+        )
+
+
+_Rule = tuple[str, Callable[[Any], bool]]
+_ONE_OR_MORE: _Rule = ("a whole number of at least 1", lambda value: value >= 1)
+_EIGHTS: _Rule = ("a multiple of 8", lambda value: value >= 8 and value % 8 == 0)  # normalized in 8 groups
+_POSITIVE: _Rule = ("a number above 0", lambda value: value > 0)
+_NOT_NEGATIVE: _Rule = ("a number of at least 0", lambda value: value >= 0)
+_FRACTION: _Rule = ("a number from 0 to 1", lambda value: 0 <= value <= 1)
+_ALLOWED: dict[str, _Rule] = {
+    "images.resolution": ("a multiple of 16, from 16 to 1024", lambda value: 16 <= value <= 1024 and value % 16 == 0),
+    "layout.grid": ("a whole number from 3 to 64", lambda value: 3 <= value <= 64),
+    "layout.steps": _ONE_OR_MORE,
+    "layout.bending": _NOT_NEGATIVE,
+    "layout.samples": _ONE_OR_MORE,
+    "reenactnet.encoder_channels": _EIGHTS,
+    "reenactnet.code": _ONE_OR_MORE,
+    "reenactnet.seed_channels": _EIGHTS,
+    "reenactnet.decoder_channels": _EIGHTS,
+    "reenactnet.kernel": ("an odd number from 3 to 15", lambda value: 3 <= value <= 15 and value % 2 == 1),
+    "bpnet.channels": _EIGHTS,
+    "bpnet.hidden": _ONE_OR_MORE,
+    "bpnet.epochs": _POSITIVE,
+    "bpnet.steps": _ONE_OR_MORE,
+    "bpnet.batch_size": _ONE_OR_MORE,
+    "bpnet.learning_rate": _POSITIVE,
+    "bpnet.weight_loss": _NOT_NEGATIVE,
+    "bpnet.image_loss": _NOT_NEGATIVE,
+    "bpnet.vertex_loss": _NOT_NEGATIVE,
+    "bpnet.decoded_fraction": _FRACTION,
+    "training.steps": _ONE_OR_MORE,
+    "training.epochs": _POSITIVE,
+    "training.batch_size": _ONE_OR_MORE,
+    "training.learning_rate": _POSITIVE,
+    "training.weight_decay": _NOT_NEGATIVE,
+    "training.elastic": _FRACTION,
+    "training.fixed_frames": _ONE_OR_MORE,
+    "training.seed": ("a whole number from 0 to 2^63 - 1", lambda value: 0 <= value < 2**63),
+    "training.save_every": _ONE_OR_MORE,
+    "training.keep": _ONE_OR_MORE,
+    "training.threads": _ONE_OR_MORE,
+}
+"""What the numbers allow, in words and as a test; None always passes where the type has it."""
+
+
+def _build(kind: type, table: dict[str, Any], origin: str, prefix: str) -> Any:
+    types_of = get_type_hints(kind)
+    for key in table:
+        if key not in types_of:
+            raise ReenactError(f"{origin}: unknown key {prefix}{key}{_suggestion(prefix + key)}")
+    return kind(**{key: _convert(types_of[key], value, origin, prefix + key) for key, value in table.items()})
+
+
+def _convert(kind: Any, value: Any, origin: str, key: str) -> Any:
+    """The value as the type of its field; a whole number may stand where a fraction is expected."""
+    if is_dataclass(kind):
+        if not isinstance(value, dict):
+            raise ReenactError(f"{origin}: {key}: expected a section [{key}], got {_words(value)}")
+        return _build(kind, value, origin, prefix=f"{key}.")
+    options = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    for option in options:
+        if get_origin(option) is Literal:
+            if value in get_args(option):
+                return value
+        elif type(value) is option:  # not isinstance: True is an int to Python
+            return value
+        elif option is float and type(value) is int and abs(value) <= 2**53:  # beyond, floats skip numbers
+            return float(value)
+    expected = " or ".join(text for option in options for text in _expected(option))
+    raise ReenactError(f"{origin}: {key}: expected {expected}, got {_words(value)}")
+
+
+_TYPE_WORDS = {
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    bool: "true or false",
+    dict: "a section",
+    list: "a list",
+}
+
+
+def _expected(option: Any) -> list[str]:
+    if get_origin(option) is Literal:
+        return [json.dumps(choice) for choice in get_args(option)]
+    return [] if option is types.NoneType else [_TYPE_WORDS[option]]  # TOML has no null: a key is left out
+
+
+def _words(value: Any) -> str:
+    shown = json.dumps(value, ensure_ascii=False, default=str)
+    shown = shown if len(shown) <= 40 else shown[:37] + "..."
+    kind = _TYPE_WORDS.get(type(value), type(value).__name__).removeprefix("a ")
+    return shown if isinstance(value, bool) else f"the {kind} {shown}"
+
+
+def _suggestion(key: str) -> str:
+    known = [name for name, _ in _leaves(Config())] + [f.name for f in fields(Config) if "." not in f.name]
+    same_name = [name for name in known if name.rpartition(".")[2] == key.rpartition(".")[2]]
+    nearest = sorted(set(same_name)) or difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+    return f"; did you mean {' or '.join(nearest)}?" if nearest else "; see `reenact train --help` for all keys"
+
+
+def _leaves(section: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    """Dotted name and value of every setting, in order."""
+    leaves = []
+    for setting in fields(section):
+        value = getattr(section, setting.name)
+        key = f"{prefix}{setting.name}"
+        leaves += _leaves(value, f"{key}.") if is_dataclass(value) else [(key, value)]
+    return leaves
+
+
+def _is_unicode(text: str) -> bool:
+    return not any("\ud800" <= character <= "\udfff" for character in text)  # bytes of a path that no encoding explains
+
+
+def _toml_lines(section: Any, prefix: str = "") -> list[str]:
+    values = {setting.name: getattr(section, setting.name) for setting in fields(section)}
+    lines = [f"[{prefix}]"] if prefix else []
+    lines += [_toml_line(key, value) for key, value in values.items() if not is_dataclass(value)]
+    for key, value in values.items():  # sections last: keys after one would belong to it
+        if is_dataclass(value):
+            lines += ["", *_toml_lines(value, f"{prefix}.{key}" if prefix else key)]
+    return lines if prefix else [*lines, ""]
+
+
+def _toml_line(key: str, value: Any) -> str:
+    if value is None:
+        return f"# {key} is not set"
+    if isinstance(value, bool):
+        return f"{key} = {str(value).lower()}"
+    if isinstance(value, str):  # TOML's strings are JSON's, but for one character that must be escaped
+        return f"{key} = {json.dumps(value, ensure_ascii=False)}".replace("\x7f", "\\u007f")
+    return f"{key} = {value!r}"
