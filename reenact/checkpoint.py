@@ -1,0 +1,380 @@
+"""Checkpoint: everything a run needs to go on, on disk, never half of it.
+
+A checkpoint is one safetensors file: tensors, and in its header a JSON text with the step and the rest of the state,
+and a SHA-256 of it all. One file, so that no crash leaves tensors of one step beside the state of another. Nothing here
+reads or writes pickle: a checkpoint from a stranger cannot run code.
+
+    run/checkpoints/step-00000500.safetensors
+    run/checkpoints/latest                      name of the newest, written last
+    run/lock                                    process that trains here
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import random
+import re
+import socket
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors.torch
+import torch
+from safetensors import SafetensorError
+from torch import Tensor
+
+from reenact.atomic import write_atomically
+from reenact.errors import ReenactError
+
+FORMAT = 1
+"""Version of the layout of a checkpoint; raised by a change that older code cannot read."""
+
+_FILE_NAME = re.compile(r"step-(\d{8,})\.safetensors")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a run was at one step."""
+
+    step: int
+    """Optimizer steps done."""
+    tensors: dict[str, Tensor]
+    """Parameters, moments and the like by flat name, on the CPU."""
+    state: dict[str, Any]
+    """Everything that is not a tensor, as it comes out of JSON: tuples have become lists."""
+
+
+def save_checkpoint(
+    run_dir: Path, step: int, tensors: dict[str, Tensor], state: dict[str, Any], *, keep: int = 3
+) -> Path:
+    """The file of a new checkpoint; older ones are removed once it is safe on disk.
+
+    Args:
+        run_dir: Folder of the run.
+        step: Optimizer steps done.
+        tensors: By flat name; on any device.
+        state: Ready for JSON.
+        keep: Newest checkpoints up to this step that stay.
+
+    Raises:
+        OSError: No space, no permission; every earlier checkpoint is still there.
+    """
+    folder = run_dir / "checkpoints"
+    folder.mkdir(parents=True, exist_ok=True)
+    for leftover in folder.glob(".*.tmp"):  # of a process that was killed while it wrote
+        leftover.unlink(missing_ok=True)
+    # Copies: parameters may share memory, which safetensors refuses, or lie in another order.
+    copies = {name: tensor.detach().to("cpu", copy=True).contiguous() for name, tensor in tensors.items()}
+    text = json.dumps({"format": FORMAT, "step": step, "state": state})
+    header = {"reenact": text, "sha256": _digest(copies, text)}
+    path = folder / f"step-{step:08d}.safetensors"
+    write_atomically(path, safetensors.torch.save(copies, metadata=header))
+    write_atomically(folder / "latest", f"{path.name}\n".encode())
+    # Later steps than this one are left alone: they are of a run that went back, and its next saves replace them.
+    for old in [file for file in _checkpoints(run_dir) if _step(file) <= step][:-keep]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def load_checkpoint(run_dir: Path) -> Checkpoint:
+    """The latest checkpoint that is whole; warns when a newer one is not.
+
+    Raises:
+        FileNotFoundError: The run has saved none yet, or there is no such run.
+        ReenactError: None of them can be read, or a newer version of Reenact wrote them.
+    """
+    paths = _newest_first(run_dir)
+    if not paths:
+        raise FileNotFoundError(
+            f"{run_dir}: expected checkpoints in {run_dir / 'checkpoints'}, got none; train it first"
+        )
+    for index, path in enumerate(paths):
+        try:
+            checkpoint = _read(path)
+        except (OSError, _Torn) as error:
+            following = f"; going on from {paths[index + 1].name}" if index + 1 < len(paths) else ""
+            warnings.warn(f"{path}: expected a whole checkpoint, got a damaged one ({error}){following}", stacklevel=2)
+        else:
+            return checkpoint
+    raise ReenactError(
+        f"{run_dir}: expected a whole checkpoint, got {len(paths)} damaged ones; restore the folder or train again"
+    )
+
+
+def has_checkpoint(run_dir: Path) -> bool:
+    """Whether the run has saved anything."""
+    return bool(_checkpoints(run_dir))
+
+
+class _Torn(Exception):
+    """This file is not what was saved."""
+
+
+def _read(path: Path) -> Checkpoint:
+    data = path.read_bytes()  # not mapped: the file may be replaced while its tensors are in use
+    try:
+        tensors = safetensors.torch.load(data)
+        # `load` has checked that the header fits the file, but does not hand out its texts.
+        header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])["__metadata__"]
+        content = json.loads(header["reenact"])
+        version, step, state = content["format"], content["step"], content["state"]
+        digest = header["sha256"]
+        if not (isinstance(version, int) and isinstance(step, int) and isinstance(state, dict)):
+            raise _Torn("its header lacks format, step or state")
+    # RuntimeError: JSON nested too deep; the others: the header is JSON, but of another kind.
+    except (SafetensorError, RuntimeError, ValueError, LookupError, TypeError, AttributeError) as error:
+        raise _Torn(str(error) or type(error).__name__) from error
+    if digest != _digest(tensors, header["reenact"]):  # the same in every format, so checked before it
+        raise _Torn("its SHA-256 differs from what was saved")
+    if version > FORMAT:
+        raise ReenactError(
+            f"{path}: expected a checkpoint of format {FORMAT} or older, got {version}; update Reenact to read it"
+        )
+    return Checkpoint(step=step, tensors=tensors, state=state)
+
+
+def _digest(tensors: dict[str, Tensor], text: str) -> str:
+    digest = hashlib.sha256(text.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"\n{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+def _checkpoints(run_dir: Path) -> list[Path]:
+    """Files of checkpoints, oldest first."""
+    folder = run_dir / "checkpoints"
+    return sorted((file for file in folder.glob("step-*") if _FILE_NAME.fullmatch(file.name)), key=_step)
+
+
+def _step(path: Path) -> int:
+    match = _FILE_NAME.fullmatch(path.name)
+    assert match is not None
+    return int(match[1])
+
+
+def _newest_first(run_dir: Path) -> list[Path]:
+    """The one that `latest` names, then older ones, then those of an abandoned future."""
+    paths = _checkpoints(run_dir)[::-1]
+    pointer = run_dir / "checkpoints" / "latest"
+    name = pointer.read_text(errors="replace").strip() if pointer.is_file() else ""
+    first = next((path for path in paths if path.name == name), paths[0] if paths else None)
+    return sorted(paths, key=lambda path: (_step(path) > _step(first), -_step(path)))
+
+
+def flatten_optimizer(
+    optimizer: torch.optim.Optimizer, prefix: str = "optimizer"
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """An optimizer's state as tensors by flat name, and the rest ready for JSON; `restore_optimizer` is the inverse.
+
+    Parameters are known by their index in the order in which the optimizer was given them.
+    """
+    content = optimizer.state_dict()
+    tensors, scalars = {}, {}
+    for index, entries in content["state"].items():
+        for name, value in entries.items():
+            kind = tensors if isinstance(value, Tensor) else scalars
+            kind[f"{prefix}.{index}.{name}"] = value
+    return tensors, {"groups": content["param_groups"], "scalars": scalars}
+
+
+def restore_optimizer(
+    optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], state: dict[str, Any], prefix: str = "optimizer"
+) -> None:
+    """Put back what `flatten_optimizer` took out, bit for bit.
+
+    Args:
+        tensors: May hold others beside the optimizer's, as a checkpoint's do.
+        state: The second part of what `flatten_optimizer` returned.
+
+    Raises:
+        ReenactError: The optimizer has other parameters than the one that was saved.
+    """
+    content: dict[str, Any] = {"state": {}, "param_groups": []}
+    now = optimizer.state_dict()["param_groups"]
+    sizes, saved_sizes = [[len(group["params"]) for group in groups] for groups in (now, state["groups"])]
+    if sizes != saved_sizes:
+        raise ReenactError(
+            f"{prefix}: expected a state for {sizes} parameters, got one for {saved_sizes}; "
+            f"resume with the run's settings"
+        )
+    for group, fresh in zip(state["groups"], now, strict=True):
+        # JSON has no tuples, and `betas` is one.
+        kinds = {key: tuple(value) if isinstance(fresh.get(key), tuple) else value for key, value in group.items()}
+        content["param_groups"].append(kinds)
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    own_name = re.compile(rf"{re.escape(prefix)}\.(\d+)\.(.+)")
+    for name, value in {**tensors, **state["scalars"]}.items():
+        match = own_name.fullmatch(name)
+        if match is None:
+            continue
+        index, key = int(match[1]), match[2]
+        shape = tuple(parameters[index].shape) if index < len(parameters) else None
+        if (
+            isinstance(value, Tensor) and value.dim() and tuple(value.shape) != shape
+        ):  # a count of steps has no dimension
+            raise ReenactError(
+                f"{name}: expected shape {shape}, got {tuple(value.shape)}; resume with the run's settings"
+            )
+        content["state"].setdefault(index, {})[key] = value.clone() if isinstance(value, Tensor) else value
+    optimizer.load_state_dict(content)
+
+
+Generator = torch.Generator | np.random.Generator
+
+
+def random_state(**generators: Generator) -> dict[str, Any]:
+    """The state of every source of random numbers, ready for JSON.
+
+    Args:
+        generators: The run's own, by any name (NumPy's as `default_rng` makes them); the global ones of Python, NumPy
+            and PyTorch are always included.
+    """
+    numpy_state: dict[str, Any] = np.random.get_state(legacy=False)  # noqa: NPY002 - libraries draw from it
+    numpy_state["state"] = {"key": numpy_state["state"]["key"].tolist(), "pos": int(numpy_state["state"]["pos"])}
+    state: dict[str, Any] = {
+        "python": random.getstate(),
+        "numpy": numpy_state,
+        "torch": _encode(torch.get_rng_state()),
+        "cuda": [_encode(each) for each in torch.cuda.get_rng_state_all()] if torch.cuda.is_available() else [],
+    }
+    own = {
+        name: _encode(generator.get_state())
+        if isinstance(generator, torch.Generator)
+        else generator.bit_generator.state
+        for name, generator in generators.items()
+    }
+    return {"global": state, "own": own}
+
+
+def restore_random_state(state: dict[str, Any], **generators: Generator) -> None:
+    """Put back what `random_state` took out: the same numbers follow.
+
+    Raises:
+        ReenactError: The state is of other generators.
+    """
+    if set(generators) != set(state["own"]):
+        raise ReenactError(
+            f"random state: expected generators {sorted(generators)}, got {sorted(state['own'])}; "
+            f"resume with the version of Reenact that saved it"
+        )
+    everyone = state["global"]
+    version, key, gauss = everyone["python"]
+    random.setstate((version, tuple(key), gauss))
+    numpy_state = everyone["numpy"]
+    numpy_key = np.array(numpy_state["state"]["key"], dtype=np.uint32)
+    np.random.set_state({**numpy_state, "state": {**numpy_state["state"], "key": numpy_key}})  # noqa: NPY002
+    torch.set_rng_state(_decode(everyone["torch"]))
+    if torch.cuda.is_available() and len(everyone["cuda"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all([_decode(each) for each in everyone["cuda"]])
+    for name, generator in generators.items():
+        if isinstance(generator, torch.Generator):
+            generator.set_state(_decode(state["own"][name]))
+        else:
+            generator.bit_generator.state = state["own"][name]
+
+
+def _encode(state: Tensor) -> str:
+    return base64.b64encode(state.numpy().tobytes()).decode()
+
+
+def _decode(text: str) -> Tensor:
+    return torch.frombuffer(bytearray(base64.b64decode(text)), dtype=torch.uint8)
+
+
+class RunLock:
+    """Keeps a second process out of a run folder for the length of a `with` block.
+
+    The lock belongs to the process, not to the file: the system takes it back when the process ends, however it ends,
+    so a lock file that is left behind means nothing. On file systems without locks, the process id in the file decides.
+
+    Raises:
+        ReenactError: Another process holds it; the message names that process.
+        OSError: The folder cannot be written.
+    """
+
+    def __init__(self, run_dir: Path):
+        self.run_dir = run_dir
+        self.path = run_dir / "lock"
+        self._descriptor: int | None = None
+
+    def __enter__(self) -> RunLock:
+        descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            holder = _holder(descriptor)
+            try:
+                free = _lock(descriptor)
+            except OSError:  # a file system without locks
+                free = not _alive(holder)
+            if not free:
+                process, machine = holder.get("pid", "unknown"), holder.get("host", "an unknown machine")
+                raise ReenactError(
+                    f"{self.run_dir}: expected no other process to train here, got process {process} on {machine}; "
+                    f"wait for it, end it, or choose another run folder"
+                )
+            os.ftruncate(descriptor, 0)
+            os.lseek(descriptor, 0, os.SEEK_SET)
+            os.write(descriptor, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
+        except BaseException:
+            os.close(descriptor)
+            raise
+        self._descriptor = descriptor
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        assert self._descriptor is not None, "a lock is left once, after it was entered"
+        os.ftruncate(self._descriptor, 0)  # the file stays: removing it could remove the lock of the next process
+        os.close(self._descriptor)
+        self._descriptor = None
+
+
+def _lock(descriptor: int) -> bool:
+    """Take the system's lock on the file unless another process has it; raises OSError where there are no locks."""
+    if os.name == "nt":
+        import msvcrt
+
+        os.lseek(
+            descriptor, 1 << 30, os.SEEK_SET
+        )  # Windows hides locked bytes from readers: lock one that is not there
+        try:
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        except PermissionError:
+            return False
+        return True
+    import fcntl
+
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _holder(descriptor: int) -> dict[str, Any]:
+    """Process and machine that the lock file names; empty after a clean end."""
+    try:
+        content = json.loads(os.read(descriptor, 1000))
+    except ValueError:
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _alive(holder: dict[str, Any]) -> bool:
+    if not isinstance(holder.get("pid"), int):
+        return False
+    if holder.get("host") != socket.gethostname():
+        return True  # nobody here can tell
+    try:
+        os.kill(holder["pid"], 0)  # signal 0 only asks
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # alive, and somebody else's
+        return True
+    return True
