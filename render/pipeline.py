@@ -1,0 +1,129 @@
+"""render(): vertices -> picture, in one differentiable call."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from render.camera import Camera
+from render.kernels.function import Fused, Scene, topology
+from render.shade import Light, linear_from_srgb
+
+BUFFERS = ("color", "mask", "normals", "depth", "parts")
+
+
+def render(
+    vertices: Float[Tensor, "B V 3"],
+    faces: Int[Tensor, "F 3"],
+    camera: Camera,
+    light: Light,
+    *,
+    height: int,
+    width: int,
+    colors: Float[Tensor, "V 3"] | None = None,
+    texture: Float[Tensor, "Ht Wt 3"] | None = None,
+    uv: Float[Tensor, "U 2"] | None = None,
+    uv_faces: Int[Tensor, "F 3"] | None = None,
+    parts: Int[Tensor, "V"] | None = None,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    buffers: Sequence[str] = ("color",),
+) -> dict[str, Tensor]:
+    """Pictures of a batch of deformed copies of one mesh, from the outside: back faces are not drawn.
+
+    Args:
+        vertices: World space, metres; float32 or float64.
+        faces: Triangles, counter-clockwise from outside.
+        camera: Sees all copies.
+        light: Lights all copies.
+        height: Of the pictures, pixels.
+        width: Of the pictures, pixels.
+        colors: sRGB in [0, 1]; None is white.
+        texture: sRGB in [0, 1], multiplies `colors`; needs `uv`.
+        uv: Texture coordinates, (0, 0) top left, clamped at the borders.
+        uv_faces: Triangles that index `uv`; None where they equal `faces`.
+        parts: Any label of each vertex; a pixel takes that of the nearest corner of its triangle.
+        background: sRGB of what no triangle covers.
+        buffers: Which of `BUFFERS` to make.
+
+    Returns:
+        For each requested buffer, row 0 at the top:
+        `color` (B, 3, H, W), sRGB in [0, 1];
+        `mask` (B, 1, H, W), share of the pixel that is covered;
+        `normals` (B, 3, H, W), unit normals in camera space where covered, 0 outside;
+        `depth` (B, 1, H, W), metres in front of the camera at the pixel's centre, 0 outside;
+        `parts` (B, 1, H, W) int64, -1 outside.
+        Colour, mask and normals are blended across silhouettes. Gradient reaches vertices, camera matrix, light
+        position, colours and texture from colour, mask, normals and depth; which triangle is seen has none.
+
+    Raises:
+        ValueError: A vertex is not finite, a face names a missing vertex, a buffer is unknown, a size or count
+            disagrees.
+    """
+    _check(vertices, faces, height, width, colors, texture, uv, uv_faces, parts, background, buffers)
+    dtype = vertices.dtype
+    face_array, edge_array = topology(faces, vertices.shape[1])
+    number = np.float64 if dtype == torch.float64 else np.float32
+    if texture is None:
+        uv_array, uv_face_array = np.zeros((0, 2), number), np.zeros((0, 3), np.int32)
+    else:
+        uv_array = np.ascontiguousarray(uv.detach().to(dtype).numpy())
+        uv_face_array = face_array if uv_faces is None else np.ascontiguousarray(uv_faces.numpy(), dtype=np.int32)
+    scene = Scene(
+        faces=face_array,
+        edges=edge_array,
+        uv=uv_array,
+        uv_faces=uv_face_array,
+        phong=np.array([light.ambient, light.diffuse, light.specular, light.shininess], number),
+        lens=np.array([camera.focal * height / 2, (width - 1) / 2, (height - 1) / 2], number),
+        background=linear_from_srgb(torch.tensor(list(background), dtype=dtype)).numpy(),
+        height=height,
+        width=width,
+        with_normals="normals" in buffers,
+    )
+    albedo = torch.ones(vertices.shape[1], 3, dtype=dtype) if colors is None else linear_from_srgb(colors.to(dtype))
+    texels = torch.zeros(0, 0, 3, dtype=dtype) if texture is None else linear_from_srgb(texture.to(dtype))
+    color, mask, normals, depth, _ = Fused.apply(
+        camera.to_camera(vertices), albedo, texels, camera.to_camera(light.position.to(dtype)), scene
+    )
+    made = {"color": color, "mask": mask, "normals": normals, "depth": depth}
+    return {name: made[name] for name in buffers}
+
+
+def _check(vertices, faces, height, width, colors, texture, uv, uv_faces, parts, background, buffers) -> None:
+    for name in buffers:
+        if name not in BUFFERS:
+            raise ValueError(f"buffers: expected names among {', '.join(BUFFERS)}, got {name!r}")
+    if vertices.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"vertices: expected float32 or float64, got {vertices.dtype}")
+    if height < 1 or width < 1:
+        raise ValueError(f"picture size: expected at least 1 x 1 pixels, got {width} x {height}")
+    if len(background) != 3:
+        raise ValueError(f"background: expected red, green, blue, got {len(background)} numbers")
+    for name, values in (("colors", colors), ("parts", parts)):
+        if values is not None and len(values) != vertices.shape[1]:
+            raise ValueError(f"{name}: expected one for each of {vertices.shape[1]} vertices, got {len(values)}")
+    if "parts" in buffers and parts is None:
+        raise ValueError("buffers: expected the argument `parts` with the buffer 'parts', got None; pass vertex labels")
+    if texture is not None:
+        if uv is None:
+            raise ValueError("texture: expected texture coordinates with it, got uv=None; pass uv")
+        corners = faces if uv_faces is None else uv_faces
+        if corners.shape != faces.shape or (len(corners) and int(corners.max()) >= len(uv)):
+            raise ValueError(
+                f"uv_faces: expected {len(faces)} triangles of indices below {len(uv)}, got {len(corners)} "
+                f"up to {int(corners.max())}; check that uv and faces belong to the same mesh"
+            )
+    # One sum is much cheaper than a test of every number, and NaN and infinity survive it.
+    if not math.isfinite(float(vertices.detach().sum())):
+        bad = (~torch.isfinite(vertices)).any(-1).nonzero()
+        if len(bad):
+            frame, vertex = bad[0].tolist()
+            raise ValueError(
+                f"vertices: expected finite numbers, got {vertices[frame, vertex].tolist()} at vertex {vertex} of frame "
+                f"{frame}; {len(bad)} vertices are not finite"
+            )
