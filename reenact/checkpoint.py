@@ -69,8 +69,7 @@ def save_checkpoint(
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(".*.tmp"):  # of a process that was killed while it wrote
         leftover.unlink(missing_ok=True)
-    # Copies: parameters may share memory, which safetensors refuses, or lie in another order.
-    copies = {name: tensor.detach().to("cpu", copy=True).contiguous() for name, tensor in tensors.items()}
+    copies = _copies(tensors)
     text = json.dumps({"format": FORMAT, "step": step, "state": state})
     header = {"reenact": text, "sha256": _digest(copies, text)}
     path = folder / f"step-{step:08d}.safetensors"
@@ -112,6 +111,32 @@ def has_checkpoint(run_dir: Path) -> bool:
     return bool(_checkpoints(run_dir))
 
 
+def save_tensors(tensors: dict[str, Tensor], path: Path) -> None:
+    """Write named tensors alone, as safetensors, atomically.
+
+    Raises:
+        OSError: No space, no permission; what was there before still is.
+    """
+    write_atomically(path, safetensors.torch.save(_copies(tensors)))
+
+
+def load_tensors(path: Path) -> dict[str, Tensor]:
+    """The tensors of a safetensors file.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ReenactError: It is not a safetensors file, or a damaged one.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: there is no such file; restore the run folder or train again")
+    try:
+        return safetensors.torch.load(path.read_bytes())
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise ReenactError(
+            f"{path}: expected tensors, got a damaged file ({error}); restore it or train again"
+        ) from error
+
+
 class _Torn(Exception):
     """This file is not what was saved."""
 
@@ -137,6 +162,11 @@ def _read(path: Path) -> Checkpoint:
             f"{path}: expected a checkpoint of format {FORMAT} or older, got {version}; update Reenact to read it"
         )
     return Checkpoint(step=step, tensors=tensors, state=state)
+
+
+def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Parameters may share memory, or lie in another order; safetensors refuses both."""
+    return {name: tensor.detach().to("cpu", copy=True).contiguous() for name, tensor in tensors.items()}
 
 
 def _digest(tensors: dict[str, Tensor], text: str) -> str:
