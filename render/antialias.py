@@ -4,8 +4,8 @@ On a face rig triangles are smaller than pixels, so that the edge which separate
 triangle that either shows. We therefore start from the edges, as none of the published rules for larger triangles does
 (compare Laine et al. 2020, "Modular Primitives for High-Performance Differentiable Rendering",
 doi:10.1145/3414685.3417861, section 3.5): an edge is a silhouette when exactly one of its faces is a front face; it
-separates the two pixels between whose centres it passes if it lies in front of one and its own surface covers the other;
-and of several edges between two centres the outermost counts.
+separates the two pixels between whose centres it passes if it lies in front of one and its own surface covers the
+other; and of several edges between two centres the outermost counts.
 """
 
 from __future__ import annotations

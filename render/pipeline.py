@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from render.camera import Camera
-from render.kernels.function import Fused, Scene, topology
+from render.kernels.function import Fused, Scene, parts_at_pixels, topology
 from render.shade import Light, linear_from_srgb
 
 BUFFERS = ("color", "mask", "normals", "depth", "parts")
@@ -87,10 +87,13 @@ def render(
     )
     albedo = torch.ones(vertices.shape[1], 3, dtype=dtype) if colors is None else linear_from_srgb(colors.to(dtype))
     texels = torch.zeros(0, 0, 3, dtype=dtype) if texture is None else linear_from_srgb(texture.to(dtype))
-    color, mask, normals, depth, _ = Fused.apply(
-        camera.to_camera(vertices), albedo, texels, camera.to_camera(light.position.to(dtype)), scene
+    vertices_camera = camera.to_camera(vertices)
+    color, mask, normals, depth, face_img = Fused.apply(
+        vertices_camera, albedo, texels, camera.to_camera(light.position.to(dtype)), scene
     )
     made = {"color": color, "mask": mask, "normals": normals, "depth": depth}
+    if parts is not None and "parts" in buffers:
+        made["parts"] = parts_at_pixels(vertices_camera, scene, parts, face_img)
     return {name: made[name] for name in buffers}
 
 
@@ -124,6 +127,6 @@ def _check(vertices, faces, height, width, colors, texture, uv, uv_faces, parts,
         if len(bad):
             frame, vertex = bad[0].tolist()
             raise ValueError(
-                f"vertices: expected finite numbers, got {vertices[frame, vertex].tolist()} at vertex {vertex} of frame "
-                f"{frame}; {len(bad)} vertices are not finite"
+                f"vertices: expected finite numbers, got {vertices[frame, vertex].tolist()} at vertex {vertex} of "
+                f"frame {frame}; {len(bad)} vertices are not finite"
             )

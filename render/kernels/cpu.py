@@ -44,7 +44,7 @@ def _project(vertices, lens, near, screen):
 
 @_compiled
 def _vertex_normals(vertices, faces, normals):
-    """Unit sums of the adjoining faces' area-weighted normals; 0 where a vertex has no area around it."""
+    """Unit sums of the adjoining faces' area-weighted normals, 0 where there is no area, and the length of the sums."""
     normals[:] = vertices.dtype.type(0)
     for f in range(faces.shape[0]):
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -59,9 +59,11 @@ def _vertex_normals(vertices, faces, normals):
         squared = normals[v, 0] * normals[v, 0] + normals[v, 1] * normals[v, 1] + normals[v, 2] * normals[v, 2]
         if squared > vertices.dtype.type(0):
             length = math.sqrt(squared)
-            normals[v, 0] /= length
-            normals[v, 1] /= length
-            normals[v, 2] /= length
+            inverse = vertices.dtype.type(1) / length
+            normals[v, 0] *= inverse
+            normals[v, 1] *= inverse
+            normals[v, 2] *= inverse
+            normals[v, 3] = length
 
 
 @_compiled
@@ -149,7 +151,7 @@ def _mix(texture, channel, left, right, top, bottom, s, t):
 
 @_inlined
 def _phong(nx, ny, nz, px, py, pz, light, phong):
-    """Factor of the albedo, highlight, and what the backward pass needs: unit light vector l, its length, view v, dots."""
+    """Factor of the albedo, highlight; then for the backward pass light vector l, its length, view vector v, dots."""
     zero, one, two = light.dtype.type(0), light.dtype.type(1), light.dtype.type(2)
     lx, ly, lz = light[0] - px, light[1] - py, light[2] - pz
     reach = math.sqrt(lx * lx + ly * ly + lz * lz)
@@ -354,3 +356,279 @@ def forward(
         _silhouettes(screen[b], faces, edges, front[b], inverse_img[b], limits[1], pair_img[b], crossing_img[b])
         _blend(image[b], pair_img[b], crossing_img[b], blended[b])
         _encode(blended[b], color[b], mask[b], normals[b])
+
+
+@_compiled
+def _encode_backward(blended, color, g_color, g_mask, g_normals, g_blended):
+    number = blended.dtype.type
+    zero, one = number(0), number(1)
+    height, width, channels = blended.shape
+    for row in range(height):
+        for column in range(width):
+            for c in range(3):
+                x = blended[row, column, c]
+                slope = number(12.92)
+                if x > number(0.0031308):
+                    slope = (color[c, row, column] + number(0.055)) / (number(2.4) * x)
+                g_blended[row, column, c] = slope * g_color[c, row, column] if x > zero and x < one else zero
+            x = blended[row, column, 3]
+            g_blended[row, column, 3] = g_mask[0, row, column] if x >= zero and x <= one else zero
+            for c in range(4, channels):
+                g_blended[row, column, c] = g_normals[c - 4, row, column]
+
+
+@_compiled
+def _blend_backward(image, edges, screen, pair_img, crossing_img, g_blended, g_image, g_screen):
+    """Gradient of the unblended picture, and of the vertices of silhouettes as these move over the picture."""
+    number = image.dtype.type
+    half, zero, one = number(0.5), number(0), number(1)
+    height, width, channels = image.shape
+    g_image[:] = g_blended
+    g_screen[:] = zero
+    for along in range(2):
+        across = 1 - along
+        for row in range(height):
+            for column in range(width):
+                pair = pair_img[along, row, column]
+                if pair < 0:
+                    continue
+                row_after, column_after = (row, column + 1) if along == 0 else (row + 1, column)
+                excess = crossing_img[along, row, column] - half
+                row_mixed, column_mixed = (row_after, column_after) if excess > zero else (row, column)
+                g_crossing = zero
+                for c in range(channels):
+                    g = g_blended[row_mixed, column_mixed, c]
+                    g_image[row, column, c] += excess * g
+                    g_image[row_after, column_after, c] -= excess * g
+                    g_crossing += g * (image[row, column, c] - image[row_after, column_after, c])
+                p, q = edges[pair // 2, 0], edges[pair // 2, 1]
+                span = screen[q, across] - screen[p, across]
+                step = number(row if along == 0 else column)
+                fraction = (step - screen[p, across]) / span
+                slope = (screen[q, along] - screen[p, along]) / span
+                g_screen[p, along] += (one - fraction) * g_crossing
+                g_screen[q, along] += fraction * g_crossing
+                g_screen[p, across] -= (one - fraction) * slope * g_crossing
+                g_screen[q, across] -= fraction * slope * g_crossing
+
+
+@_compiled
+def _shade_backward(
+    vertices, faces, colors, uv, uv_faces, texture, light, phong, lens, normals, face_img, g_image, g_depth,
+    g_vertices, g_colors, g_texture, g_light, g_normals,
+):  # fmt: skip
+    """Gradient through colour, normal and depth of each pixel to the three vertices of its face, and to the light."""
+    number = vertices.dtype.type
+    zero, one, two = number(0), number(1), number(2)
+    height, width, channels = g_image.shape
+    focal = one / lens[0]
+    textured = texture.shape[0] > 0
+    g_albedo = np.zeros(3, vertices.dtype)
+    base = np.zeros(3, vertices.dtype)
+    for row in range(height):
+        y = (lens[2] - number(row)) * focal
+        for column in range(width):
+            f = face_img[row, column]
+            if f == BACKGROUND:
+                continue
+            x = (number(column) - lens[1]) * focal
+            i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+            # The forward pass again: recomputing is cheaper than storing.
+            bi, bj, bk, area = _barycentrics(vertices, i, j, k, x, y)
+            nx = bi * normals[i, 0] + bj * normals[j, 0] + bk * normals[k, 0]
+            ny = bi * normals[i, 1] + bj * normals[j, 1] + bk * normals[k, 1]
+            nz = bi * normals[i, 2] + bj * normals[j, 2] + bk * normals[k, 2]
+            squared = nx * nx + ny * ny + nz * nz
+            shrink = one / math.sqrt(squared) if squared > zero else zero
+            nx, ny, nz = nx * shrink, ny * shrink, nz * shrink
+            wi, wj, wk = -vertices[i, 2], -vertices[j, 2], -vertices[k, 2]
+            depth = bi * wi + bj * wj + bk * wk
+            factor, _, lx, ly, lz, reach, vx, vy, vz, n_l, n_v, r_v = _phong(
+                nx, ny, nz, depth * x, depth * y, -depth, light, phong
+            )
+
+            # Colour = factor * albedo + highlight; albedo = vertex colour * texel.
+            g_factor, g_highlight, g_u, g_v = zero, zero, zero, zero
+            for c in range(3):
+                g = g_image[row, column, c]
+                base[c] = bi * colors[i, c] + bj * colors[j, c] + bk * colors[k, c]
+                g_albedo[c] = g * factor
+                g_factor += g * base[c]
+                g_highlight += g
+            if textured:
+                ui, uj, uk = uv_faces[f, 0], uv_faces[f, 1], uv_faces[f, 2]
+                u = bi * uv[ui, 0] + bj * uv[uj, 0] + bk * uv[uk, 0]
+                v = bi * uv[ui, 1] + bj * uv[uj, 1] + bk * uv[uk, 1]
+                left, right, top, bottom, s, t = _texel(texture, u, v)
+                g_factor = zero
+                for c in range(3):
+                    texel = _mix(texture, c, left, right, top, bottom, s, t)
+                    g_factor += g_image[row, column, c] * base[c] * texel
+                    g_texel = g_albedo[c] * base[c]
+                    g_albedo[c] *= texel
+                    upper = texture[top, right, c] - texture[top, left, c]
+                    lower = texture[bottom, right, c] - texture[bottom, left, c]
+                    g_u += g_texel * ((one - t) * upper + t * lower) * number(texture.shape[1])
+                    before = (one - s) * texture[top, left, c] + s * texture[top, right, c]
+                    after = (one - s) * texture[bottom, left, c] + s * texture[bottom, right, c]
+                    g_v += g_texel * (after - before) * number(texture.shape[0])
+                    if g_texture.shape[0] > 0:
+                        g_texture[top, left, c] += g_texel * (one - s) * (one - t)
+                        g_texture[top, right, c] += g_texel * s * (one - t)
+                        g_texture[bottom, left, c] += g_texel * (one - s) * t
+                        g_texture[bottom, right, c] += g_texel * s * t
+            g_bi, g_bj, g_bk = zero, zero, zero
+            for c in range(3):
+                g_bi += g_albedo[c] * colors[i, c]
+                g_bj += g_albedo[c] * colors[j, c]
+                g_bk += g_albedo[c] * colors[k, c]
+                if g_colors.shape[0] > 0:
+                    g_colors[i, c] += g_albedo[c] * bi
+                    g_colors[j, c] += g_albedo[c] * bj
+                    g_colors[k, c] += g_albedo[c] * bk
+            if textured:
+                g_bi += g_u * uv[ui, 0] + g_v * uv[ui, 1]
+                g_bj += g_u * uv[uj, 0] + g_v * uv[uj, 1]
+                g_bk += g_u * uv[uk, 0] + g_v * uv[uk, 1]
+
+            # Phong: factor = ambient + diffuse n.l, highlight = specular (r.v) ^ shininess, r.v = 2 n.l n.v - l.v.
+            g_nx, g_ny, g_nz, g_w = zero, zero, zero, g_depth[row, column]
+            if n_l > zero:
+                g_n_l, g_n_v, g_l_v = phong[1] * g_factor, zero, zero
+                if r_v > zero and phong[2] > zero:
+                    g_r_v = g_highlight * phong[2] * phong[3] * r_v ** (phong[3] - one)
+                    g_n_l += two * n_v * g_r_v
+                    g_n_v, g_l_v = two * n_l * g_r_v, -g_r_v
+                g_nx, g_ny, g_nz = g_n_l * lx + g_n_v * vx, g_n_l * ly + g_n_v * vy, g_n_l * lz + g_n_v * vz
+                g_lx, g_ly, g_lz = g_n_l * nx + g_l_v * vx, g_n_l * ny + g_l_v * vy, g_n_l * nz + g_l_v * vz
+                radial = lx * g_lx + ly * g_ly + lz * g_lz
+                shorten = one / reach
+                g_lx = (g_lx - lx * radial) * shorten
+                g_ly = (g_ly - ly * radial) * shorten
+                g_lz = (g_lz - lz * radial) * shorten
+                g_light[0] += g_lx
+                g_light[1] += g_ly
+                g_light[2] += g_lz
+                # The point moves along its ray only, so the view vector does not turn.
+                g_w -= x * g_lx + y * g_ly - g_lz
+            if channels > 4:
+                g_nx += g_image[row, column, 4]
+                g_ny += g_image[row, column, 5]
+                g_nz += g_image[row, column, 6]
+            radial = nx * g_nx + ny * g_ny + nz * g_nz
+            g_nx, g_ny, g_nz = (
+                (g_nx - nx * radial) * shrink,
+                (g_ny - ny * radial) * shrink,
+                (g_nz - nz * radial) * shrink,
+            )
+            g_bi += g_nx * normals[i, 0] + g_ny * normals[i, 1] + g_nz * normals[i, 2] + g_w * wi
+            g_bj += g_nx * normals[j, 0] + g_ny * normals[j, 1] + g_nz * normals[j, 2] + g_w * wj
+            g_bk += g_nx * normals[k, 0] + g_ny * normals[k, 1] + g_nz * normals[k, 2] + g_w * wk
+            for v, b in ((i, bi), (j, bj), (k, bk)):
+                g_normals[v, 0] += g_nx * b
+                g_normals[v, 1] += g_ny * b
+                g_normals[v, 2] += g_nz * b
+
+            # Barycentric coordinates: areas of the sheared face over their sum.
+            mean = bi * g_bi + bj * g_bj + bk * g_bk
+            inverse = one / area
+            g_ei, g_ej, g_ek = (g_bi - mean) * inverse, (g_bj - mean) * inverse, (g_bk - mean) * inverse
+            xi, yi = vertices[i, 0] - x * wi, vertices[i, 1] - y * wi
+            xj, yj = vertices[j, 0] - x * wj, vertices[j, 1] - y * wj
+            xk, yk = vertices[k, 0] - x * wk, vertices[k, 1] - y * wk
+            g_xi, g_yi = yj * g_ek - yk * g_ej, xk * g_ej - xj * g_ek
+            g_xj, g_yj = yk * g_ei - yi * g_ek, xi * g_ek - xk * g_ei
+            g_xk, g_yk = yi * g_ej - yj * g_ei, xj * g_ei - xi * g_ej
+            g_vertices[i, 0] += g_xi
+            g_vertices[i, 1] += g_yi
+            g_vertices[i, 2] += x * g_xi + y * g_yi - g_w * bi
+            g_vertices[j, 0] += g_xj
+            g_vertices[j, 1] += g_yj
+            g_vertices[j, 2] += x * g_xj + y * g_yj - g_w * bj
+            g_vertices[k, 0] += g_xk
+            g_vertices[k, 1] += g_yk
+            g_vertices[k, 2] += x * g_xk + y * g_yk - g_w * bk
+
+
+@_compiled
+def _vertex_normals_backward(vertices, faces, normals, g_normals, g_vertices):
+    zero, one = vertices.dtype.type(0), vertices.dtype.type(1)
+    for v in range(vertices.shape[0]):
+        length = normals[v, 3]
+        gx, gy, gz = g_normals[v, 0], g_normals[v, 1], g_normals[v, 2]
+        inverse = one / length if length > zero else zero
+        radial = gx * normals[v, 0] + gy * normals[v, 1] + gz * normals[v, 2]
+        g_normals[v, 0] = (gx - normals[v, 0] * radial) * inverse
+        g_normals[v, 1] = (gy - normals[v, 1] * radial) * inverse
+        g_normals[v, 2] = (gz - normals[v, 2] * radial) * inverse
+    for f in range(faces.shape[0]):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        gx = g_normals[i, 0] + g_normals[j, 0] + g_normals[k, 0]
+        gy = g_normals[i, 1] + g_normals[j, 1] + g_normals[k, 1]
+        gz = g_normals[i, 2] + g_normals[j, 2] + g_normals[k, 2]
+        if gx == zero and gy == zero and gz == zero:
+            continue
+        ax, ay, az = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
+        bx, by, bz = vertices[k, 0] - vertices[i, 0], vertices[k, 1] - vertices[i, 1], vertices[k, 2] - vertices[i, 2]
+        g_ax, g_ay, g_az = by * gz - bz * gy, bz * gx - bx * gz, bx * gy - by * gx
+        g_bx, g_by, g_bz = gy * az - gz * ay, gz * ax - gx * az, gx * ay - gy * ax
+        g_vertices[i, 0] -= g_ax + g_bx
+        g_vertices[i, 1] -= g_ay + g_by
+        g_vertices[i, 2] -= g_az + g_bz
+        g_vertices[j, 0] += g_ax
+        g_vertices[j, 1] += g_ay
+        g_vertices[j, 2] += g_az
+        g_vertices[k, 0] += g_bx
+        g_vertices[k, 1] += g_by
+        g_vertices[k, 2] += g_bz
+
+
+@_compiled
+def _project_backward(vertices, lens, screen, g_screen, g_vertices):
+    for v in range(vertices.shape[0]):
+        scale = lens[0] * screen[v, 2]
+        g_x, g_y = scale * g_screen[v, 0], -scale * g_screen[v, 1]
+        g_vertices[v, 0] += g_x
+        g_vertices[v, 1] += g_y
+        g_vertices[v, 2] += (vertices[v, 0] * g_x + vertices[v, 1] * g_y) * screen[v, 2]
+
+
+@_compiled
+def backward(
+    first, last, vertices, faces, edges, colors, uv, uv_faces, texture, light, phong, lens, screen, vertex_normals,
+    face_img, image, pair_img, crossing_img, blended, color, g_color, g_mask, g_normals, g_depth,
+    g_vertices, g_colors, g_texture, g_light,
+):  # fmt: skip
+    """Gradients of frames `first` to `last`; `g_vertices`, `g_colors`, `g_texture`, `g_light` start at 0."""
+    g_blended, g_image = np.empty_like(image[0]), np.empty_like(image[0])
+    g_screen = np.empty((vertices.shape[1], 2), vertices.dtype)
+    g_vertex_normals = np.empty((vertices.shape[1], 3), vertices.dtype)
+    for b in range(first, last):
+        _encode_backward(blended[b], color[b], g_color[b], g_mask[b], g_normals[b], g_blended)
+        _blend_backward(image[b], edges, screen[b], pair_img[b], crossing_img[b], g_blended, g_image, g_screen)
+        g_vertex_normals[:] = vertices.dtype.type(0)
+        _shade_backward(
+            vertices[b], faces, colors, uv, uv_faces, texture, light, phong, lens, vertex_normals[b], face_img[b],
+            g_image, g_depth[b, 0], g_vertices[b], g_colors[b], g_texture[b], g_light[b], g_vertex_normals,
+        )  # fmt: skip
+        _vertex_normals_backward(vertices[b], faces, vertex_normals[b], g_vertex_normals, g_vertices[b])
+        _project_backward(vertices[b], lens, screen[b], g_screen, g_vertices[b])
+
+
+@_compiled
+def parts_at_pixels(first, last, vertices, faces, parts, lens, face_img, part_img):
+    """Label of the nearest corner (by barycentric coordinate) of the face in each pixel; -1 on the background."""
+    focal = vertices.dtype.type(1) / lens[0]
+    for b in range(first, last):
+        for row in range(face_img.shape[1]):
+            y = (lens[2] - vertices.dtype.type(row)) * focal
+            for column in range(face_img.shape[2]):
+                f = face_img[b, row, column]
+                if f == BACKGROUND:
+                    part_img[b, 0, row, column] = -1
+                    continue
+                x = (vertices.dtype.type(column) - lens[1]) * focal
+                i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+                bi, bj, bk, _ = _barycentrics(vertices[b], i, j, k, x, y)
+                nearest = i if bi >= bj and bi >= bk else (j if bj >= bk else k)
+                part_img[b, 0, row, column] = parts[nearest]

@@ -6,6 +6,7 @@ import os
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -33,53 +34,87 @@ class Scene:
 
 
 class Fused(torch.autograd.Function):
-    """Camera-space vertices, linear colours, linear texture, camera-space light -> colour, mask, normals, depth, faces."""
+    """Camera-space vertices and light, linear colours and texture -> colour, mask, normals, depth, faces."""
 
     @staticmethod
     def forward(ctx, vertices: Tensor, colors: Tensor, texture: Tensor, light: Tensor, scene: Scene) -> tuple:
-        dtype = vertices.dtype
         batch, count, _ = vertices.shape
         height, width = scene.height, scene.width
         channels = 7 if scene.with_normals else 4
         new = vertices.new_empty
-        screen, vertex_normals = new(batch, count, 3), new(batch, count, 3)
+        screen, vertex_normals = new(batch, count, 3), new(batch, count, 4)
         front = new((batch, len(scene.faces)), dtype=torch.uint8)
         face_img = new((batch, height, width), dtype=torch.int32)
         inverse_img = new(batch, height, width)
         image, blended = new(batch, height, width, channels), new(batch, height, width, channels)
         pair_img, crossing_img = new((batch, 2, height, width), dtype=torch.int32), new(batch, 2, height, width)
         color, mask = new(batch, 3, height, width), new(batch, 1, height, width)
-        normals = new(batch, 3 if scene.with_normals else 0, height, width)
-        inputs = [_array(tensor) for tensor in (vertices, colors, texture, light)]
-        limits = np.array([NEAR, DEPTH_MARGIN], _numpy_dtype(dtype))
-        outputs = [
-            tensor.numpy()
-            for tensor in (
-                screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img, blended, color,
-                mask, normals,
-            )
-        ]  # fmt: skip
+        normals = new(batch, channels - 4, height, width)
+        inputs = [tensor.detach().contiguous() for tensor in (vertices, colors, texture, light)]
+        limits = np.array([NEAR, DEPTH_MARGIN], scene.lens.dtype)
         over_frames(
-            cpu.forward, batch, inputs[0], scene.faces, scene.edges, inputs[1], scene.uv, scene.uv_faces, inputs[2],
-            inputs[3], scene.phong, scene.lens, limits, scene.background, *outputs,
+            cpu.forward, batch, *_scene_arrays(scene, *inputs), limits, scene.background,
+            screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img, blended, color, mask,
+            normals,
         )  # fmt: skip
         depth = torch.where(inverse_img > 0, 1 / inverse_img, 0.0)[:, None]
+        ctx.scene = scene
+        ctx.save_for_backward(*inputs, screen, vertex_normals, face_img, image, pair_img, crossing_img, blended, color)
         ctx.mark_non_differentiable(face_img)
         return color, mask, normals, depth, face_img
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, g_color: Tensor, g_mask: Tensor, g_normals: Tensor, g_depth: Tensor, _) -> tuple:
+        inputs, buffers = ctx.saved_tensors[:4], ctx.saved_tensors[4:]
+        vertices, colors, texture, _ = inputs
+        batch = len(vertices)
+        _, wants_colors, wants_texture, _, _ = ctx.needs_input_grad
+        g_vertices = torch.zeros_like(vertices)
+        g_colors = vertices.new_zeros(batch, *(colors.shape if wants_colors else (0, 3)))
+        g_texture = vertices.new_zeros(batch, *(texture.shape if wants_texture else (0, 0, 3)))
+        g_light = vertices.new_zeros(batch, 3)
+        over_frames(
+            cpu.backward, batch, *_scene_arrays(ctx.scene, *inputs), *buffers,
+            *(gradient.contiguous() for gradient in (g_color, g_mask, g_normals, g_depth)),
+            g_vertices, g_colors, g_texture, g_light,
+        )  # fmt: skip
+        return (
+            g_vertices,
+            g_colors.sum(0) if wants_colors else None,
+            g_texture.sum(0) if wants_texture else None,
+            g_light.sum(0),
+            None,
+        )
+
+
+def _scene_arrays(scene: Scene, vertices: Tensor, colors: Tensor, texture: Tensor, light: Tensor) -> tuple:
+    return (
+        vertices, scene.faces, scene.edges, colors, scene.uv, scene.uv_faces, texture, light, scene.phong, scene.lens,
+    )  # fmt: skip
+
+
+def parts_at_pixels(vertices: Tensor, scene: Scene, parts: Tensor, face_img: Tensor) -> Tensor:
+    """Label of the nearest corner of the face in each pixel, -1 on the background: (B, 1, H, W) int64."""
+    part_img = torch.empty(len(vertices), 1, scene.height, scene.width, dtype=torch.int64)
+    vertices, parts = vertices.detach().contiguous(), parts.long().contiguous()
+    over_frames(cpu.parts_at_pixels, len(vertices), vertices, scene.faces, parts, scene.lens, face_img, part_img)
+    return part_img
 
 
 _pool: ThreadPoolExecutor | None = None
 
 
-def over_frames(kernel, batch: int, *arrays: np.ndarray) -> None:
+def over_frames(kernel, batch: int, *arrays: np.ndarray | Tensor) -> None:
     """Run `kernel(first, last, *arrays)` over all frames on as many threads as torch uses."""
+    arrays = tuple(array.numpy() if isinstance(array, Tensor) else array for array in arrays)
     threads = min(torch.get_num_threads(), batch)
     if threads == 1:
         kernel(0, batch, *arrays)
         return
     # Twice as many pieces as threads even out frames of different cost.
     bounds = np.linspace(0, batch, min(batch, 2 * threads) + 1).round().astype(int).tolist()
-    pieces = list(zip(bounds[:-1], bounds[1:]))
+    pieces = list(pairwise(bounds))
     if not kernel.signatures:
         kernel(*pieces.pop(0), *arrays)  # compiles once, not in every thread
     futures = [_workers().submit(kernel, first, last, *arrays) for first, last in pieces]
@@ -129,11 +164,3 @@ def topology(faces: Tensor, vertex_count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _indices(tensor: Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.numpy(), dtype=np.int32)
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()
-
-
-def _numpy_dtype(dtype: torch.dtype) -> type:
-    return {torch.float32: np.float32, torch.float64: np.float64}[dtype]
