@@ -185,6 +185,11 @@ def config_from_dict(table: dict[str, Any], origin: str = "settings") -> Config:
     return _build(Config, table, origin, prefix="")
 
 
+def changed_keys(old: Config, new: Config) -> list[str]:
+    """Dotted names of the settings whose values differ."""
+    return [key for (key, value), (_, other) in zip(_leaves(old), _leaves(new), strict=True) if value != other]
+
+
 def check_config(config: Config, origin: str = "settings") -> None:
     """Refuse values that cannot work, before any work is done.
 

@@ -1,0 +1,326 @@
+"""The commands: reenact train | infer | evaluate | convert | rigs."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from rich.console import Console
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.extras import subcommand_cli_from_dict
+
+from reenact.config import Config, changed_keys, check_config, load_config
+from reenact.errors import ReenactError
+
+# The rest of the project is imported inside the commands: PyTorch takes seconds to load, `--help` should not.
+if TYPE_CHECKING:
+    from rich.table import Table
+
+_CLIP_FILES = (".csv", ".npz", ".glb")
+_RIG_FILES = (".glb", ".npz")
+
+
+def train(
+    settings: Annotated[Config, arg(name="")] = Config(),  # noqa: B008 - frozen
+    *,
+    config: Annotated[Path | None, arg(metavar="FILE.toml")] = None,
+    resume: Annotated[bool, FlagCreatePairsOff] = False,
+) -> None:
+    """Train networks that move expressions between two rigs.
+
+    A rig is a built-in name (`reenact rigs` lists them) or a .glb or .npz file. A clip is a .csv, .npz or .glb file, or
+    synthetic:SEED[:SECONDS]. Settings come from their defaults, then from --config, then from the options below.
+
+    Args:
+        settings: Every setting.
+        config: TOML file with settings; see configs/.
+        resume: Go on with the stopped run in --run, with the settings it began with.
+    """
+    check_config(settings, origin="command line")
+    if resume:
+        if settings.run is None:
+            raise ReenactError("--resume: expected the folder of a run beside it, got none; add --run DIR")
+        saved = load_config(_run_config(settings.run))
+        changed = changed_keys(saved, replace(settings, run=saved.run))
+        if changed:
+            raise ReenactError(
+                f"{settings.run}: expected the settings that the run began with, got other {', '.join(changed)}; "
+                f"leave them out, or train a new run without --resume"
+            )
+    from reenact.training import train
+
+    train(settings, resume=resume)
+
+
+def infer(
+    run: Annotated[Positional[Path], arg(metavar="RUN")],
+    clip: Annotated[Positional[str], arg(metavar="CLIP")],
+    *,
+    out: Annotated[Path, arg(metavar="FILE")],
+    reverse: Annotated[bool, FlagCreatePairsOff] = False,
+) -> None:
+    """Move a clip from a run's source rig to its target.
+
+    Args:
+        run: Folder that `reenact train` wrote.
+        clip: Motion of the source rig: a .csv (Live Link Face or a plain table), .npz or .glb file, or
+            synthetic:SEED[:SECONDS].
+        out: File to write; by its suffix a table (.csv), arrays (.npz), or the animated target rig (.glb).
+        reverse: From the target to the source instead.
+    """
+    _check_out(out, _CLIP_FILES)
+    _run_config(run)
+    from reenact.inference import ImageRetargeter
+    from reenact.rigs.files import load_clip, save_clip
+
+    retargeter = ImageRetargeter.load(run, reverse=reverse)
+    moved = retargeter(load_clip(clip, retargeter.source))
+    save_clip(moved, out, retargeter.target)
+    print(f"{out}: {len(moved)} frames, {moved.duration:.1f} s, {retargeter.source.name} -> {retargeter.target.name}")
+
+
+def evaluate(
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN [RUN ...]", help_behavior_hint="(one or more)")],
+    *,
+    frames: int = 600,
+    seed: int = 0,
+) -> None:
+    """Measure trained runs on clips that they have not seen, and write a report.
+
+    Numbers go to RUN/evaluation/metrics.json. The report is one page with the table, curves and pictures.
+
+    Args:
+        runs: Folders that `reenact train` wrote.
+        frames: Frames to measure on, in all.
+        seed: Of the clips; the same seed gives every run on the same rigs the same clips.
+    """
+    if not runs:
+        raise ReenactError("evaluate: expected at least one run folder, got none; name the folders after the command")
+    for run in runs:
+        _run_config(run)
+    from reenact.evaluation import evaluate
+    from reenact.report import write_report
+
+    console, results = Console(), []
+    for run in runs:
+        with console.status(f"{run}") as status:
+            results.append(evaluate(run, frames, seed, lambda stage, run=run, s=status: s.update(f"{run}: {stage}")))
+        for table in _tables(results[-1]):
+            console.print(table)
+    console.print(f"Report: {write_report(list(runs), results)}", highlight=False, soft_wrap=True)
+
+
+def convert(
+    input: Annotated[Positional[str], arg(metavar="IN")],
+    output: Annotated[Positional[Path], arg(metavar="OUT")],
+    *,
+    rig: Annotated[str | None, arg(metavar="RIG")] = None,
+) -> None:
+    """Turn a rig or a clip into another format.
+
+    Rigs: built-in names, .glb and .npz to .glb and .npz. Clips: .csv, .npz, .glb and synthetic:SEED[:SECONDS] to .csv,
+    .npz and .glb, which need --rig, the rig that they move.
+
+    Args:
+        input: A file, a built-in rig, or with --rig a clip.
+        output: File to write, in the format of its suffix.
+        rig: Read IN as a clip of this rig: a built-in name or a file. Writing .glb puts the rig in, animated.
+    """
+    from reenact.rigs.files import load_clip, load_rig, save_clip, save_rig
+
+    if rig is not None:
+        _check_out(output, _CLIP_FILES)
+        moved_rig = load_rig(rig)
+        clip = load_clip(input, moved_rig)
+        save_clip(clip, output, moved_rig)
+        print(f"{output}: {len(clip)} frames, {clip.duration:.1f} s, {len(clip.names)} blendshapes")
+        return
+    if ".csv" in (Path(input).suffix.lower(), output.suffix.lower()) or input.startswith("synthetic:"):
+        raise ReenactError(f"{input}: expected --rig RIG beside a clip, got none; name the rig that the clip moves")
+    _check_out(output, _RIG_FILES)
+    loaded = load_rig(input)
+    save_rig(loaded, output)
+    print(
+        f"{output}: {len(loaded.neutral)} vertices, {len(loaded.faces)} faces, {len(loaded.names)} blendshapes: "
+        f"{', '.join(loaded.names[:4])}{', ...' if len(loaded.names) > 4 else ''}"
+    )
+
+
+def rigs(
+    *,
+    out: Annotated[Path | None, arg(metavar="FILE.png")] = None,
+    size: int = 192,
+) -> None:
+    """List the built-in rigs, and draw them.
+
+    Args:
+        out: Write a contact sheet: a row per rig, its neutral first, then expressions.
+        size: Height and width of each picture of the sheet, in pixels.
+    """
+    if out is not None:
+        _check_out(out, (".png",))
+    if not 16 <= size <= 1024:
+        raise ReenactError(f"--size: expected 16 to 1024 pixels, got {size}")
+    from reenact.rigs.anny import BUILT_IN
+
+    console = Console()
+    for name, description in BUILT_IN.items():
+        console.print(f"[bold]{name:<12}[/bold] {description}", highlight=False, soft_wrap=True)
+    if out is None:
+        console.print("\nTo see them: reenact rigs --out rigs.png", highlight=False)
+        return
+    with console.status("Drawing"):
+        _draw_rigs(list(BUILT_IN), size, out)
+    console.print(f"\nContact sheet: {out}", highlight=False, soft_wrap=True)
+
+
+COMMANDS = {"train": train, "infer": infer, "evaluate": evaluate, "convert": convert, "rigs": rigs}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; the exit status: 0 for success, 2 for the user's mistake, 130 for Ctrl-C.
+
+    Anything else that goes wrong is our mistake, and escapes with its traceback.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    console = Console(stderr=True)
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_: _say(console, "yellow", "warning", str(message))
+        try:
+            commands = {**COMMANDS, "train": partial(train, settings=_train_defaults(arguments))}
+            subcommand_cli_from_dict(
+                commands,
+                prog="reenact",
+                description="Any two blendshape rigs and a clip for the first: returns the clip on the second.",
+                args=arguments,
+            )
+        except KeyboardInterrupt:
+            _say(console, "red", "stopped", "by the keyboard")
+            return 130
+        except ReenactError as error:
+            _say(console, "red", "error", str(error))
+            return 2
+        except OSError as error:  # a file that is missing or forbidden, a full disk
+            where = f"{error.filename}: " if error.filename else ""
+            _say(console, "red", "error", f"{where}{error.strerror}" if error.strerror else str(error))
+            return 2
+    return 0
+
+
+def _say(console: Console, color: str, kind: str, message: str) -> None:
+    console.print(f"[{color}]{kind}:[/{color}]", end=" ", highlight=False)
+    console.print(message, markup=False, highlight=False, soft_wrap=True)  # a name may look like markup
+
+
+def _train_defaults(arguments: list[str]) -> Config:
+    """Where the settings of `train` start: the file in --config, or the stopped run that --resume goes on with."""
+    if arguments[:1] != ["train"]:
+        return Config()
+    config, run = _option(arguments, "--config"), _option(arguments, "--run")
+    if config is not None:
+        return load_config(config)
+    if run is not None and "--resume" in arguments:
+        return replace(load_config(_run_config(run)), run=run)
+    return Config()
+
+
+def _option(arguments: list[str], name: str) -> str | None:
+    """The value of an option, before the settings that it chooses can be parsed with the rest."""
+    for index, argument in enumerate(arguments):
+        if argument == name and index + 1 < len(arguments):
+            return arguments[index + 1]
+        if argument.startswith(f"{name}="):
+            return argument.removeprefix(f"{name}=")
+    return None
+
+
+def _run_config(run: Path | str) -> Path:
+    path = Path(run) / "config.toml"
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{run}: expected a run folder with config.toml in it, got none; `reenact train` makes one"
+        )
+    return path
+
+
+def _check_out(path: Path, suffixes: tuple[str, ...]) -> None:
+    """Refuse a file that cannot be written, before the work whose result it should hold."""
+    if path.suffix.lower() not in suffixes:
+        raise ReenactError(
+            f"{path}: expected a name that ends in {' or '.join(suffixes)}, got {path.suffix or 'no suffix'}"
+        )
+    if path.is_dir():
+        raise ReenactError(f"{path}: expected a file to write, got a folder; name a file in it")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; make it first")
+
+
+def _tables(numbers: dict[str, Any]) -> list[Table]:
+    """What one evaluation found, for the terminal."""
+    from rich.table import Table
+
+    columns = {"retargeted": numbers, "without ReenactNet": numbers["direct"]}
+    columns |= {name.replace("_", " "): row for name, row in numbers["baselines"].items()}
+    title = f"{numbers['run']}: {numbers['source']} -> {numbers['target']}, {numbers['frames']} unseen frames"
+    compared = Table(title=title, title_justify="left")
+    compared.add_column("")
+    for name in columns:
+        compared.add_column(name, justify="right")
+    measures = {"truth": ("ver", "wmae", "correlation", "gain"), "cyclic": ("mae", "ssim", "mae_masked", "skill")}
+    for group, names in measures.items():
+        for name in names:
+            values = [(row[group] or {}).get(name) for row in columns.values()]
+            compared.add_row(f"{group}.{name}", *map(_number, values))
+    alone = Table(title="BPNet on the target's own pictures, and speed", title_justify="left")
+    for name in ("", "value"):
+        alone.add_column(name, justify="right" if name else "left")
+    for group, names in {
+        "bpnet": ("wmae", "ver", "psnr", "ssim"),
+        "speed": ("fps", "latency_ms_p50", "latency_ms_p99"),
+    }.items():
+        for name in names:
+            alone.add_row(f"{group}.{name}", _number(numbers[group][name]))
+    return [compared, alone]
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
+
+
+def _draw_rigs(names: list[str], size: int, out: Path) -> None:
+    """A row per rig: name, neutral, expressions."""
+    import torch
+    from PIL import Image, ImageDraw, ImageFont
+
+    from reenact.portrait import Portrait
+    from reenact.rigs import motion
+    from reenact.rigs.files import load_rig
+
+    count, label = 5, max(16, size // 8)
+    sheet = Image.new("RGB", (size * (1 + count), (size + label) * len(names)), "white")
+    for row, name in enumerate(names):
+        rig = load_rig(name)
+        weights = torch.cat([torch.zeros(1, len(rig.names)), motion.expressions(rig.names, count, seed=11)])
+        pictures = Portrait.of(rig).render(rig.vertices(weights), size)["color"]
+        top = row * (size + label)
+        ImageDraw.Draw(sheet).text(
+            (label // 3, top + label // 2),
+            f"{name}   {len(rig.names)} blendshapes",
+            fill="black",
+            anchor="lm",
+            font=ImageFont.load_default(0.7 * label),
+        )
+        for column, pixels in enumerate((pictures.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).numpy()):
+            sheet.paste(Image.fromarray(pixels), (column * size, top + label))
+    sheet.save(out)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
