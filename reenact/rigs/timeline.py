@@ -1,0 +1,59 @@
+"""Samples at uneven times made into frames at a constant rate."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from reenact.errors import ReenactError
+
+
+def steady(
+    where: str, times: Float[np.ndarray, "T"], weights: Float[np.ndarray, "T K"], single: float = 30.0
+) -> tuple[Float[np.ndarray, "N K"], float]:
+    """The same motion at a constant rate, and that rate in frames per second.
+
+    The rate is that of the usual step between samples, taken as whole where it is within 0.2 % of that. Evenly spaced
+    samples come back as they are. Otherwise rows are put in the order of their times, of rows closer than a quarter
+    step the last counts (a doubled frame), and frames are linear between the rows (a dropped frame).
+
+    Args:
+        where: File, for messages.
+        times: Seconds.
+        weights: One row per time.
+        single: Rate to give a single sample.
+
+    Raises:
+        ReenactError: No samples, a time that is not finite, or gaps so long that frames would outnumber samples by 20.
+    """
+    if len(times) == 0:
+        raise ReenactError(f"{where}: expected at least one frame, got none")
+    if not np.isfinite(times).all():
+        raise ReenactError(f"{where}: times must be finite, row {int((~np.isfinite(times)).argmax()) + 1} is not")
+    order = np.argsort(times, kind="stable")
+    times, weights = times[order], weights[order]
+    steps = np.diff(times)
+    if not (steps > 0).any():
+        return weights[-1:], single
+    step = float(np.median(steps[steps > 0]))
+    last_of_each = np.append(steps > 0.25 * step, True)
+    times, weights = times[last_of_each], weights[last_of_each]
+    if len(times) == 1:
+        return weights, single
+    with np.errstate(over="ignore"):
+        span = float(times[-1] - times[0])
+        even = span / (len(times) - 1)
+        evenly = np.abs(times - times[0] - even * np.arange(len(times))).max() < 0.02 * even
+        fps = 1 / (even if evenly else step)
+        if round(fps) > 0 and abs(fps - round(fps)) < 0.002 * fps:
+            fps = float(round(fps))
+        drift = abs(span * fps - (len(times) - 1))  # in frames, after rounding the rate
+        if not np.isfinite(fps) or span * fps > 20 * len(times) + 1000:
+            raise ReenactError(
+                f"{where}: expected about one row per frame, got {len(times)} rows over {span:.6g} s at {fps:.6g} fps; "
+                "check the times"
+            )
+    if evenly and drift < 0.1:
+        return weights, fps
+    grid = times[0] + np.arange(round(span * fps) + 1) / fps
+    return np.stack([np.interp(grid, times, column) for column in weights.T], axis=1), fps
