@@ -1,8 +1,11 @@
-"""render(): vertices -> picture, in one differentiable call."""
+"""render(): vertices -> picture, in one differentiable call.
+
+`render_by_stages` is the same five stages in plain torch: read that one first. The kernels behind `render` fuse them.
+"""
 
 from __future__ import annotations
 
-import math
+from collections import OrderedDict
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,9 +13,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from render.antialias import antialias
 from render.camera import Camera
+from render.interpolate import barycentrics, interpolate
 from render.kernels.function import Fused, Scene, parts_at_pixels, topology
-from render.shade import Light, linear_from_srgb
+from render.rasterize import rasterize
+from render.shade import Light, linear_from_srgb, sample_texture, shade, srgb_from_linear, unit, vertex_normals
 
 BUFFERS = ("color", "mask", "normals", "depth", "parts")
 
@@ -85,16 +91,71 @@ def render(
         width=width,
         with_normals="normals" in buffers,
     )
-    albedo = torch.ones(vertices.shape[1], 3, dtype=dtype) if colors is None else linear_from_srgb(colors.to(dtype))
-    texels = torch.zeros(0, 0, 3, dtype=dtype) if texture is None else linear_from_srgb(texture.to(dtype))
-    vertices_camera = camera.to_camera(vertices)
-    color, mask, normals, depth, face_img = Fused.apply(
-        vertices_camera, albedo, texels, camera.to_camera(light.position.to(dtype)), scene
+    color, mask, normals, inverse_depth, face_img, vertices_camera = Fused.apply(
+        vertices,
+        camera.world_to_camera.to(dtype),
+        torch.ones(vertices.shape[1], 3, dtype=dtype) if colors is None else _linear(colors, dtype),
+        torch.zeros(0, 0, 3, dtype=dtype) if texture is None else _linear(texture, dtype),
+        camera.to_camera(light.position.to(dtype)),
+        scene,
     )
-    made = {"color": color, "mask": mask, "normals": normals, "depth": depth}
+    made = {"color": color, "mask": mask, "normals": normals}
+    if "depth" in buffers:
+        made["depth"] = torch.where(face_img[:, None] >= 0, 1 / inverse_depth.clamp(min=1e-30), 0.0)
     if parts is not None and "parts" in buffers:
         made["parts"] = parts_at_pixels(vertices_camera, scene, parts, face_img)
     return {name: made[name] for name in buffers}
+
+
+_linear_colors: OrderedDict[tuple[int, torch.dtype], tuple[Tensor, int, Tensor]] = OrderedDict()
+
+
+def _linear(srgb: Tensor, dtype: torch.dtype) -> Tensor:
+    """Linear light of colours; remembered for the last few tensors, since a rig's colours are the same in each call."""
+    if srgb.requires_grad:
+        return linear_from_srgb(srgb.to(dtype))
+    key = id(srgb), dtype
+    known = _linear_colors.get(key)
+    # The tensor is kept, so its id is not given to another; _version counts changes in place.
+    if known is None or known[0] is not srgb or known[1] != srgb._version:
+        known = _linear_colors[key] = (srgb, srgb._version, linear_from_srgb(srgb.to(dtype)))
+        while len(_linear_colors) > 16:
+            _linear_colors.popitem(last=False)
+    return known[2]
+
+
+def render_by_stages(
+    vertices: Float[Tensor, "B V 3"],
+    faces: Int[Tensor, "F 3"],
+    camera: Camera,
+    light: Light,
+    *,
+    height: int,
+    width: int,
+    colors: Float[Tensor, "V 3"],
+    texture: Float[Tensor, "Ht Wt 3"] | None = None,
+    uv: Float[Tensor, "V 2"] | None = None,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+) -> dict[str, Tensor]:
+    """Colour, mask and normals as `render` makes them, one readable stage after the other and thousands of times slower.
+
+    For reading, and for testing the compiled kernels; gradients are those of autograd.
+    """
+    vertices_camera, vertices_clip = camera.to_camera(vertices), camera.project(vertices)
+    face_img = rasterize(vertices_clip, faces, height, width)
+    bary_img = barycentrics(vertices_clip, faces, face_img)
+    points = interpolate(vertices_camera, faces, face_img, bary_img)
+    normals = unit(interpolate(vertex_normals(vertices_camera, faces), faces, face_img, bary_img))
+    albedo = interpolate(linear_from_srgb(colors).expand(len(vertices), -1, -1), faces, face_img, bary_img)
+    if texture is not None:
+        uv_img = interpolate(uv.expand(len(vertices), -1, -1), faces, face_img, bary_img)
+        albedo = albedo * sample_texture(linear_from_srgb(texture), uv_img)
+    covered = (face_img >= 0)[..., None]
+    color_img = shade(albedo, normals, points, camera.to_camera(light.position.to(vertices)), light)
+    color_img = torch.where(covered, color_img, linear_from_srgb(torch.tensor(list(background)).to(vertices)))
+    everything = torch.cat([color_img, covered.to(vertices), torch.where(covered, normals, 0.0)], -1)  # (B, H, W, 7)
+    color_img, mask, normals = antialias(everything, face_img, vertices_clip, faces).movedim(-1, 1).split([3, 1, 3], 1)
+    return {"color": srgb_from_linear(color_img), "mask": mask.clamp(0, 1), "normals": normals}
 
 
 def _check(vertices, faces, height, width, colors, texture, uv, uv_faces, parts, background, buffers) -> None:
@@ -120,13 +181,4 @@ def _check(vertices, faces, height, width, colors, texture, uv, uv_faces, parts,
             raise ValueError(
                 f"uv_faces: expected {len(faces)} triangles of indices below {len(uv)}, got {len(corners)} "
                 f"up to {int(corners.max())}; check that uv and faces belong to the same mesh"
-            )
-    # One sum is much cheaper than a test of every number, and NaN and infinity survive it.
-    if not math.isfinite(float(vertices.detach().sum())):
-        bad = (~torch.isfinite(vertices)).any(-1).nonzero()
-        if len(bad):
-            frame, vertex = bad[0].tolist()
-            raise ValueError(
-                f"vertices: expected finite numbers, got {vertices[frame, vertex].tolist()} at vertex {vertex} of "
-                f"frame {frame}; {len(bad)} vertices are not finite"
             )

@@ -57,7 +57,7 @@ def vertex_normals(vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]) 
     sums = torch.zeros_like(vertices)
     for corner in range(3):
         sums = sums.index_add(1, faces[:, corner], face_normals)
-    return _unit(sums)
+    return unit(sums)
 
 
 def sample_texture(texture: Float[Tensor, "Ht Wt C"], uv_img: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch C"]:
@@ -91,7 +91,7 @@ def shade(
 
     Source: Phong 1975, with the albedo in the ambient and diffuse terms and a white highlight.
     """
-    to_light, to_eye = _unit(light_position - points), _unit(-points)
+    to_light, to_eye = unit(light_position - points), unit(-points)
     n_l, n_v = (normals * to_light).sum(-1, keepdim=True), (normals * to_eye).sum(-1, keepdim=True)
     # The light vector mirrored at the normal, against the direction to the eye.
     r_v = 2 * n_l * n_v - (to_light * to_eye).sum(-1, keepdim=True)
@@ -99,7 +99,7 @@ def shade(
     return albedo * (light.ambient + light.diffuse * n_l.clamp(min=0)) + light.specular * highlight
 
 
-def _unit(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+def unit(vectors: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
     """Vectors of length 1; a zero vector stays zero and passes no gradient on."""
     squared = (vectors**2).sum(-1, keepdim=True)
     return vectors * torch.where(squared > 0, squared, 1.0).rsqrt() * (squared > 0)

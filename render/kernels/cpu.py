@@ -8,6 +8,7 @@ sums have one order, and the result does not depend on the number of threads.
 Numbers are cast by `dtype.type` because a Python float would silently turn float32 arithmetic into float64.
 
 Space       Axes
+world       of the rig, metres
 camera      right, up, towards the viewer; w = -z is the depth in metres
 pixel       column, row, of which the centre of pixel (0, 0) is the origin
 """
@@ -24,6 +25,28 @@ LEFT_OR_ABOVE, RIGHT_OR_BELOW = 0, 1  # where the silhouette's own surface lies 
 
 _compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 _inlined = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "ninf", "nsz", "arcp", "contract"})
+
+
+@_inlined
+def _corners(faces, f):
+    """The vertices of a face, as the index type that needs no test for a negative number."""
+    return np.uintp(faces[f, 0]), np.uintp(faces[f, 1]), np.uintp(faces[f, 2])
+
+
+@_compiled
+def _to_camera(world, matrix, vertices):
+    """World points in camera space; False if one is not finite."""
+    total = vertices.dtype.type(0)
+    for v in range(world.shape[0]):
+        for row in range(3):
+            vertices[v, row] = (
+                matrix[row, 0] * world[v, 0]
+                + matrix[row, 1] * world[v, 1]
+                + matrix[row, 2] * world[v, 2]
+                + matrix[row, 3]
+            )
+            total += vertices[v, row]  # NaN and infinity survive every sum
+    return math.isfinite(total)
 
 
 @_compiled
@@ -47,7 +70,7 @@ def _vertex_normals(vertices, faces, normals):
     """Unit sums of the adjoining faces' area-weighted normals, 0 where there is no area, and the length of the sums."""
     normals[:] = vertices.dtype.type(0)
     for f in range(faces.shape[0]):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        i, j, k = _corners(faces, f)
         ax, ay, az = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1], vertices[j, 2] - vertices[i, 2]
         bx, by, bz = vertices[k, 0] - vertices[i, 0], vertices[k, 1] - vertices[i, 1], vertices[k, 2] - vertices[i, 2]
         nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
@@ -80,7 +103,7 @@ def _rasterize(screen, faces, front, face_img, inverse_img):
     inverse_img[:] = zero
     for f in range(faces.shape[0]):
         # Counter-clockwise seen from outside is clockwise once rows point down: swap two corners.
-        i, j, k = faces[f, 0], faces[f, 2], faces[f, 1]
+        i, k, j = _corners(faces, f)
         xi, yi, xj, yj, xk, yk = screen[i, 0], screen[i, 1], screen[j, 0], screen[j, 1], screen[k, 0], screen[k, 1]
         area = (xj - xi) * (yk - yi) - (xk - xi) * (yj - yi)
         zi, zj, zk = screen[i, 2], screen[j, 2], screen[k, 2]
@@ -187,7 +210,7 @@ def _shade(vertices, faces, colors, uv, uv_faces, texture, light, phong, lens, b
                     image[row, column, c] = zero
                 continue
             x = (vertices.dtype.type(column) - lens[1]) * focal
-            i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+            i, j, k = _corners(faces, f)
             bi, bj, bk, _ = _barycentrics(vertices, i, j, k, x, y)
             nx = bi * normals[i, 0] + bj * normals[j, 0] + bk * normals[k, 0]
             ny = bi * normals[i, 1] + bj * normals[j, 1] + bk * normals[k, 1]
@@ -203,7 +226,7 @@ def _shade(vertices, faces, colors, uv, uv_faces, texture, light, phong, lens, b
             green = bi * colors[i, 1] + bj * colors[j, 1] + bk * colors[k, 1]
             blue = bi * colors[i, 2] + bj * colors[j, 2] + bk * colors[k, 2]
             if texture.shape[0] > 0:
-                ui, uj, uk = uv_faces[f, 0], uv_faces[f, 1], uv_faces[f, 2]
+                ui, uj, uk = _corners(uv_faces, f)
                 u = bi * uv[ui, 0] + bj * uv[uj, 0] + bk * uv[uk, 0]
                 v = bi * uv[ui, 1] + bj * uv[uj, 1] + bk * uv[uk, 1]
                 left, right, top, bottom, s, t = _texel(texture, u, v)
@@ -308,20 +331,29 @@ _SRGB = (
 )  # fmt: skip
 
 
-@_compiled
+@_inlined
 def _encode(blended, color, mask, normals):
     """Channels-first buffers, the colour in sRGB and clamped.
 
-    x ** (1 / 2.4) = s ** (5 / 3) with s = x ** (1 / 4), which is nearly a polynomial. Roots and polynomials are vector
-    instructions, powers are not: 0.1 instead of 1 ms for 128 x 128 pixels.
+    x ** (1 / 2.4) = s ** (5 / 3) with s = x ** (1 / 4), which is nearly a polynomial. Roots and polynomials become
+    vector instructions, powers do not.
     """
     number = blended.dtype.type
     zero, one = number(0), number(1)
     height, width, channels = blended.shape
     for row in range(height):
-        for c in range(3):
+        for column in range(width):
+            color[0, row, column] = blended[row, column, 0]
+            color[1, row, column] = blended[row, column, 1]
+            color[2, row, column] = blended[row, column, 2]
+            mask[0, row, column] = min(max(blended[row, column, 3], zero), one)
+        for c in range(4, channels):
             for column in range(width):
-                x = min(max(blended[row, column, c], zero), one)
+                normals[c - 4, row, column] = blended[row, column, c]
+    for c in range(3):
+        for row in range(height):
+            for column in range(width):
+                x = min(max(color[c, row, column], zero), one)
                 s = math.sqrt(math.sqrt(x))
                 y = number(_SRGB[7])
                 y = y * s + number(_SRGB[6])
@@ -332,20 +364,19 @@ def _encode(blended, color, mask, normals):
                 y = y * s + number(_SRGB[1])
                 y = y * s + number(_SRGB[0])
                 color[c, row, column] = min(y, one) if x > number(0.0031308) else number(12.92) * x
-        for column in range(width):
-            mask[0, row, column] = min(max(blended[row, column, 3], zero), one)
-        for c in range(4, channels):
-            for column in range(width):
-                normals[c - 4, row, column] = blended[row, column, c]
 
 
 @_compiled
 def forward(
-    first, last, vertices, faces, edges, colors, uv, uv_faces, texture, light, phong, lens, limits, background,
-    screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img, blended, color, mask, normals,
+    first, last, world, matrix, faces, edges, colors, uv, uv_faces, texture, light, phong, lens, limits, background,
+    finite, vertices, screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img, blended,
+    color, mask, normals,
 ):  # fmt: skip
     """Render frames `first` to `last`; `limits` is the near plane and the relative depth margin of silhouettes."""
     for b in range(first, last):
+        finite[b] = _to_camera(world[b], matrix, vertices[b])
+        if not finite[b]:
+            continue
         _project(vertices[b], lens, limits[0], screen[b])
         _vertex_normals(vertices[b], faces, vertex_normals[b])
         _rasterize(screen[b], faces, front[b], face_img[b], inverse_img[b])
@@ -414,7 +445,7 @@ def _blend_backward(image, edges, screen, pair_img, crossing_img, g_blended, g_i
 
 @_compiled
 def _shade_backward(
-    vertices, faces, colors, uv, uv_faces, texture, light, phong, lens, normals, face_img, g_image, g_depth,
+    vertices, faces, colors, uv, uv_faces, texture, light, phong, lens, normals, face_img, g_image, g_inverse,
     g_vertices, g_colors, g_texture, g_light, g_normals,
 ):  # fmt: skip
     """Gradient through colour, normal and depth of each pixel to the three vertices of its face, and to the light."""
@@ -432,7 +463,7 @@ def _shade_backward(
             if f == BACKGROUND:
                 continue
             x = (number(column) - lens[1]) * focal
-            i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+            i, j, k = _corners(faces, f)
             # The forward pass again: recomputing is cheaper than storing.
             bi, bj, bk, area = _barycentrics(vertices, i, j, k, x, y)
             nx = bi * normals[i, 0] + bj * normals[j, 0] + bk * normals[k, 0]
@@ -456,10 +487,14 @@ def _shade_backward(
                 g_factor += g * base[c]
                 g_highlight += g
             if textured:
-                ui, uj, uk = uv_faces[f, 0], uv_faces[f, 1], uv_faces[f, 2]
+                ui, uj, uk = _corners(uv_faces, f)
                 u = bi * uv[ui, 0] + bj * uv[uj, 0] + bk * uv[uk, 0]
                 v = bi * uv[ui, 1] + bj * uv[uj, 1] + bk * uv[uk, 1]
                 left, right, top, bottom, s, t = _texel(texture, u, v)
+                columns, rows = number(texture.shape[1]), number(texture.shape[0])
+                # Beyond the outer texel centres the texture is constant.
+                u_scale = columns if u * columns > number(0.5) and u * columns < columns - number(0.5) else zero
+                v_scale = rows if v * rows > number(0.5) and v * rows < rows - number(0.5) else zero
                 g_factor = zero
                 for c in range(3):
                     texel = _mix(texture, c, left, right, top, bottom, s, t)
@@ -468,10 +503,10 @@ def _shade_backward(
                     g_albedo[c] *= texel
                     upper = texture[top, right, c] - texture[top, left, c]
                     lower = texture[bottom, right, c] - texture[bottom, left, c]
-                    g_u += g_texel * ((one - t) * upper + t * lower) * number(texture.shape[1])
+                    g_u += g_texel * ((one - t) * upper + t * lower) * u_scale
                     before = (one - s) * texture[top, left, c] + s * texture[top, right, c]
                     after = (one - s) * texture[bottom, left, c] + s * texture[bottom, right, c]
-                    g_v += g_texel * (after - before) * number(texture.shape[0])
+                    g_v += g_texel * (after - before) * v_scale
                     if g_texture.shape[0] > 0:
                         g_texture[top, left, c] += g_texel * (one - s) * (one - t)
                         g_texture[top, right, c] += g_texel * s * (one - t)
@@ -492,7 +527,7 @@ def _shade_backward(
                 g_bk += g_u * uv[uk, 0] + g_v * uv[uk, 1]
 
             # Phong: factor = ambient + diffuse n.l, highlight = specular (r.v) ^ shininess, r.v = 2 n.l n.v - l.v.
-            g_nx, g_ny, g_nz, g_w = zero, zero, zero, g_depth[row, column]
+            g_nx, g_ny, g_nz, g_w = zero, zero, zero, -g_inverse[row, column] / (depth * depth)
             if n_l > zero:
                 g_n_l, g_n_v, g_l_v = phong[1] * g_factor, zero, zero
                 if r_v > zero and phong[2] > zero:
@@ -562,7 +597,7 @@ def _vertex_normals_backward(vertices, faces, normals, g_normals, g_vertices):
         g_normals[v, 1] = (gy - normals[v, 1] * radial) * inverse
         g_normals[v, 2] = (gz - normals[v, 2] * radial) * inverse
     for f in range(faces.shape[0]):
-        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        i, j, k = _corners(faces, f)
         gx = g_normals[i, 0] + g_normals[j, 0] + g_normals[k, 0]
         gy = g_normals[i, 1] + g_normals[j, 1] + g_normals[k, 1]
         gz = g_normals[i, 2] + g_normals[j, 2] + g_normals[k, 2]
@@ -594,25 +629,43 @@ def _project_backward(vertices, lens, screen, g_screen, g_vertices):
 
 
 @_compiled
+def _to_camera_backward(world, matrix, g_vertices, g_world, g_matrix):
+    if g_matrix.shape[0] > 0:
+        for v in range(world.shape[0]):
+            for row in range(3):
+                for c in range(3):
+                    g_matrix[row, c] += g_vertices[v, row] * world[v, c]
+                g_matrix[row, 3] += g_vertices[v, row]
+    for v in range(world.shape[0]):
+        for c in range(3):
+            g_world[v, c] = (
+                matrix[0, c] * g_vertices[v, 0] + matrix[1, c] * g_vertices[v, 1] + matrix[2, c] * g_vertices[v, 2]
+            )
+
+
+@_compiled
 def backward(
-    first, last, vertices, faces, edges, colors, uv, uv_faces, texture, light, phong, lens, screen, vertex_normals,
-    face_img, image, pair_img, crossing_img, blended, color, g_color, g_mask, g_normals, g_depth,
-    g_vertices, g_colors, g_texture, g_light,
+    first, last, world, matrix, faces, edges, colors, uv, uv_faces, texture, light, phong, lens,
+    vertices, screen, vertex_normals, face_img, image, pair_img, crossing_img, blended, color,
+    g_color, g_mask, g_normals, g_inverse, g_world, g_matrix, g_colors, g_texture, g_light,
 ):  # fmt: skip
-    """Gradients of frames `first` to `last`; `g_vertices`, `g_colors`, `g_texture`, `g_light` start at 0."""
+    """Gradients of frames `first` to `last`; all but `g_world` start at 0."""
+    g_vertices = np.empty_like(vertices[0])
     g_blended, g_image = np.empty_like(image[0]), np.empty_like(image[0])
     g_screen = np.empty((vertices.shape[1], 2), vertices.dtype)
     g_vertex_normals = np.empty((vertices.shape[1], 3), vertices.dtype)
     for b in range(first, last):
         _encode_backward(blended[b], color[b], g_color[b], g_mask[b], g_normals[b], g_blended)
         _blend_backward(image[b], edges, screen[b], pair_img[b], crossing_img[b], g_blended, g_image, g_screen)
+        g_vertices[:] = vertices.dtype.type(0)
         g_vertex_normals[:] = vertices.dtype.type(0)
         _shade_backward(
             vertices[b], faces, colors, uv, uv_faces, texture, light, phong, lens, vertex_normals[b], face_img[b],
-            g_image, g_depth[b, 0], g_vertices[b], g_colors[b], g_texture[b], g_light[b], g_vertex_normals,
+            g_image, g_inverse[b, 0], g_vertices, g_colors[b], g_texture[b], g_light[b], g_vertex_normals,
         )  # fmt: skip
-        _vertex_normals_backward(vertices[b], faces, vertex_normals[b], g_vertex_normals, g_vertices[b])
-        _project_backward(vertices[b], lens, screen[b], g_screen, g_vertices[b])
+        _vertex_normals_backward(vertices[b], faces, vertex_normals[b], g_vertex_normals, g_vertices)
+        _project_backward(vertices[b], lens, screen[b], g_screen, g_vertices)
+        _to_camera_backward(world[b], matrix, g_vertices, g_world[b], g_matrix[b])
 
 
 @_compiled
@@ -628,7 +681,7 @@ def parts_at_pixels(first, last, vertices, faces, parts, lens, face_img, part_im
                     part_img[b, 0, row, column] = -1
                     continue
                 x = (vertices.dtype.type(column) - lens[1]) * focal
-                i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+                i, j, k = _corners(faces, f)
                 bi, bj, bk, _ = _barycentrics(vertices[b], i, j, k, x, y)
                 nearest = i if bi >= bj and bi >= bk else (j if bj >= bk else k)
                 part_img[b, 0, row, column] = parts[nearest]

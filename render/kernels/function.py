@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -34,15 +34,22 @@ class Scene:
 
 
 class Fused(torch.autograd.Function):
-    """Camera-space vertices and light, linear colours and texture -> colour, mask, normals, depth, faces."""
+    """World vertices, 3 x 4 camera matrix, linear colours and texture, camera-space light -> pictures.
+
+    Returns colour, mask, normals (no channels unless asked for), inverse depth, and the face of each pixel; then the
+    camera-space vertices, for whoever wants to look up more.
+    """
 
     @staticmethod
-    def forward(ctx, vertices: Tensor, colors: Tensor, texture: Tensor, light: Tensor, scene: Scene) -> tuple:
-        batch, count, _ = vertices.shape
+    def forward(
+        ctx, world: Tensor, matrix: Tensor, colors: Tensor, texture: Tensor, light: Tensor, scene: Scene
+    ) -> tuple[Tensor, ...]:
+        batch, count, _ = world.shape
         height, width = scene.height, scene.width
         channels = 7 if scene.with_normals else 4
-        new = vertices.new_empty
-        screen, vertex_normals = new(batch, count, 3), new(batch, count, 4)
+        new = world.new_empty
+        finite = new(batch, dtype=torch.bool)
+        vertices, screen, vertex_normals = new(batch, count, 3), new(batch, count, 3), new(batch, count, 4)
         front = new((batch, len(scene.faces)), dtype=torch.uint8)
         face_img = new((batch, height, width), dtype=torch.int32)
         inverse_img = new(batch, height, width)
@@ -50,55 +57,76 @@ class Fused(torch.autograd.Function):
         pair_img, crossing_img = new((batch, 2, height, width), dtype=torch.int32), new(batch, 2, height, width)
         color, mask = new(batch, 3, height, width), new(batch, 1, height, width)
         normals = new(batch, channels - 4, height, width)
-        inputs = [tensor.detach().contiguous() for tensor in (vertices, colors, texture, light)]
+        inputs = [tensor.detach().contiguous() for tensor in (world, matrix, colors, texture, light)]
         limits = np.array([NEAR, DEPTH_MARGIN], scene.lens.dtype)
         over_frames(
             cpu.forward, batch, *_scene_arrays(scene, *inputs), limits, scene.background,
-            screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img, blended, color, mask,
-            normals,
+            finite, vertices, screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img,
+            blended, color, mask, normals,
         )  # fmt: skip
-        depth = torch.where(inverse_img > 0, 1 / inverse_img, 0.0)[:, None]
+        if not bool(finite.all()):
+            _report_not_finite(world)
         ctx.scene = scene
-        ctx.save_for_backward(*inputs, screen, vertex_normals, face_img, image, pair_img, crossing_img, blended, color)
-        ctx.mark_non_differentiable(face_img)
-        return color, mask, normals, depth, face_img
+        ctx.save_for_backward(
+            *inputs, vertices, screen, vertex_normals, face_img, image, pair_img, crossing_img, blended, color
+        )
+        ctx.mark_non_differentiable(face_img, vertices)
+        # depth = 1 / inverse_img is left to the caller: few ask for it.
+        return color, mask, normals, inverse_img[:, None], face_img, vertices
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g_color: Tensor, g_mask: Tensor, g_normals: Tensor, g_depth: Tensor, _) -> tuple:
-        inputs, buffers = ctx.saved_tensors[:4], ctx.saved_tensors[4:]
-        vertices, colors, texture, _ = inputs
-        batch = len(vertices)
-        _, wants_colors, wants_texture, _, _ = ctx.needs_input_grad
-        g_vertices = torch.zeros_like(vertices)
-        g_colors = vertices.new_zeros(batch, *(colors.shape if wants_colors else (0, 3)))
-        g_texture = vertices.new_zeros(batch, *(texture.shape if wants_texture else (0, 0, 3)))
-        g_light = vertices.new_zeros(batch, 3)
+    def backward(ctx, g_color: Tensor, g_mask: Tensor, g_normals: Tensor, g_inverse: Tensor, *_) -> tuple:
+        inputs, buffers = ctx.saved_tensors[:5], ctx.saved_tensors[5:]
+        world, _, colors, texture, _ = inputs
+        _, wants_matrix, wants_colors, wants_texture, wants_light, _ = ctx.needs_input_grad
+        batch, zeros = len(world), world.new_zeros
+        g_world = torch.empty_like(world)
+        g_matrix = zeros(batch, 3 if wants_matrix else 0, 4)
+        g_colors = zeros(batch, *(colors.shape if wants_colors else (0, 3)))
+        g_texture = zeros(batch, *(texture.shape if wants_texture else (0, 0, 3)))
+        g_light = zeros(batch, 3)
         over_frames(
             cpu.backward, batch, *_scene_arrays(ctx.scene, *inputs), *buffers,
-            *(gradient.contiguous() for gradient in (g_color, g_mask, g_normals, g_depth)),
-            g_vertices, g_colors, g_texture, g_light,
+            *(gradient.contiguous() for gradient in (g_color, g_mask, g_normals, g_inverse)),
+            g_world, g_matrix, g_colors, g_texture, g_light,
         )  # fmt: skip
+        # Frames were kept apart up to here, so that the sums do not depend on the threads.
         return (
-            g_vertices,
+            g_world,
+            g_matrix.sum(0) if wants_matrix else None,
             g_colors.sum(0) if wants_colors else None,
             g_texture.sum(0) if wants_texture else None,
-            g_light.sum(0),
+            g_light.sum(0) if wants_light else None,
             None,
         )
 
 
-def _scene_arrays(scene: Scene, vertices: Tensor, colors: Tensor, texture: Tensor, light: Tensor) -> tuple:
+def _scene_arrays(scene: Scene, world, matrix, colors, texture, light) -> tuple:
     return (
-        vertices, scene.faces, scene.edges, colors, scene.uv, scene.uv_faces, texture, light, scene.phong, scene.lens,
+        world, matrix, scene.faces, scene.edges, colors, scene.uv, scene.uv_faces, texture, light, scene.phong,
+        scene.lens,
     )  # fmt: skip
+
+
+def _report_not_finite(world: Tensor) -> None:
+    bad = (~torch.isfinite(world)).any(-1).nonzero()
+    if not len(bad):
+        raise ValueError("camera: expected finite numbers, got NaN or infinity in the matrix or vertices out of range")
+    frame, vertex = bad[0].tolist()
+    raise ValueError(
+        f"vertices: expected finite numbers, got {world[frame, vertex].tolist()} at vertex {vertex} of frame {frame}; "
+        f"{len(bad)} vertices of the batch are not finite"
+    )
 
 
 def parts_at_pixels(vertices: Tensor, scene: Scene, parts: Tensor, face_img: Tensor) -> Tensor:
     """Label of the nearest corner of the face in each pixel, -1 on the background: (B, 1, H, W) int64."""
     part_img = torch.empty(len(vertices), 1, scene.height, scene.width, dtype=torch.int64)
-    vertices, parts = vertices.detach().contiguous(), parts.long().contiguous()
-    over_frames(cpu.parts_at_pixels, len(vertices), vertices, scene.faces, parts, scene.lens, face_img, part_img)
+    over_frames(
+        cpu.parts_at_pixels, len(vertices), vertices, scene.faces, parts.long().contiguous(), scene.lens, face_img,
+        part_img,
+    )  # fmt: skip
     return part_img
 
 
@@ -109,17 +137,27 @@ def over_frames(kernel, batch: int, *arrays: np.ndarray | Tensor) -> None:
     """Run `kernel(first, last, *arrays)` over all frames on as many threads as torch uses."""
     arrays = tuple(array.numpy() if isinstance(array, Tensor) else array for array in arrays)
     threads = min(torch.get_num_threads(), batch)
-    if threads == 1:
+    if threads <= 1:
         kernel(0, batch, *arrays)
         return
-    # Twice as many pieces as threads even out frames of different cost.
-    bounds = np.linspace(0, batch, min(batch, 2 * threads) + 1).round().astype(int).tolist()
-    pieces = list(pairwise(bounds))
+    # Small pieces, the calling thread among those who take them: a core that is busy with something else takes fewer.
+    bounds = np.linspace(0, batch, min(batch, 4 * threads) + 1).round().astype(int).tolist()
+    pieces = deque(pairwise(bounds))
+
+    def work() -> None:
+        while True:
+            try:
+                first, last = pieces.popleft()
+            except IndexError:
+                return
+            kernel(first, last, *arrays)
+
     if not kernel.signatures:
-        kernel(*pieces.pop(0), *arrays)  # compiles once, not in every thread
-    futures = [_workers().submit(kernel, first, last, *arrays) for first, last in pieces]
-    for future in futures:
-        future.result()
+        kernel(*pieces.popleft(), *arrays)  # compiles once, not in every thread
+    helpers = [_workers().submit(work) for _ in range(threads - 1)]
+    work()
+    for helper in helpers:
+        helper.result()
 
 
 def _workers() -> ThreadPoolExecutor:
