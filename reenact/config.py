@@ -22,6 +22,8 @@ class ImageConfig:
 
     resolution: int = 64
     """Height and width in pixels; a multiple of 16."""
+    supersample: int = 2
+    """Render this many times larger and average, so that fine triangles do not flicker."""
     residual: bool = True
     """Show each network the picture minus the rig's own neutral picture, so that identity, texture and light cancel."""
 

@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from reenact.config import ImageConfig
 from reenact.losses import VertexDistance, motion_weight
 from reenact.portrait import Portrait
 from reenact.rigs import motion
@@ -24,8 +25,7 @@ class Studio:
     def __init__(
         self,
         rig: Rig,
-        resolution: int,
-        residual: bool = True,
+        config: ImageConfig,
         layout: Float[Tensor, "R R 2"] | None = None,
         clip: Clip | None = None,
         fixed_frames: int | None = None,
@@ -34,14 +34,16 @@ class Studio:
         """
         Args:
             rig: Photographed by `Portrait.of`.
-            resolution: Pixels along each side.
-            residual: Networks see the difference from the neutral picture; else the picture itself.
-            layout: Sampling grid in [-1, 1] (x, y) that warps each picture onto the shared layout; None leaves it.
+            config: Resolution of the pictures, and whether networks see differences from the neutral.
+            layout: Sampling grid in [-1, 1] (x, y) of any resolution that warps each picture onto the shared layout;
+                None leaves it.
             clip: Training motion with the rig's names; None samples random valid expressions without end.
             fixed_frames: Draw only this many expressions, once.
             seed: Of the survey and of the fixed expressions.
         """
-        self.rig, self.resolution, self.residual, self.layout = rig, resolution, residual, layout
+        self.rig, self.resolution, self.residual = rig, config.resolution, config.residual
+        self.rendered_at = config.supersample * config.resolution
+        self.layout = None if layout is None else resize_grid(layout, self.rendered_at)
         self.portrait = Portrait.of(rig)
         self.pool = None if clip is None else clip.weights
         if fixed_frames is not None:
@@ -62,9 +64,11 @@ class Studio:
         self, weights: Float[Tensor, "N K"], buffers: tuple[str, ...] = ("color",)
     ) -> Float[Tensor, "N C R R"]:
         """Pictures in [0, 1] in the shared layout, the named buffers stacked along channels. Differentiable."""
-        rendered = self.portrait.render(self.rig.vertices(weights), self.resolution, buffers)
+        rendered = self.portrait.render(self.rig.vertices(weights), self.rendered_at, buffers)
         picture = torch.cat([rendered[name] for name in buffers], dim=1)
-        return picture if self.layout is None else warp(picture, self.layout)
+        if self.layout is not None:
+            picture = warp(picture, self.layout)
+        return F.adaptive_avg_pool2d(picture, self.resolution)
 
     def show(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
         """What a network sees of pictures: residuals, or the pictures themselves."""
@@ -80,6 +84,15 @@ def warp(pictures: Float[Tensor, "N C H W"], grid: Float[Tensor, "H W 2"]) -> Fl
     return F.grid_sample(
         pictures, grid.expand(len(pictures), -1, -1, -1), mode="bilinear", padding_mode="border", align_corners=False
     )
+
+
+def resize_grid(grid: Float[Tensor, "H W 2"], resolution: int) -> Float[Tensor, "R R 2"]:
+    """A sampling grid at another resolution; positions are relative, so its smooth displacement is interpolated."""
+    if len(grid) == resolution:
+        return grid
+    displacement = (grid - identity_grid(len(grid))).permute(2, 0, 1)[None]
+    fine = F.interpolate(displacement, size=(resolution, resolution), mode="bicubic", align_corners=False)
+    return identity_grid(resolution) + fine[0].permute(1, 2, 0)
 
 
 def identity_grid(resolution: int) -> Float[Tensor, "R R 2"]:

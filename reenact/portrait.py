@@ -18,10 +18,10 @@ from reenact.rigs import arkit
 from reenact.rigs.rig import Rig
 from render import Camera, Light, render
 
-EYE_HEIGHT = 0.40
+EYE_HEIGHT = 0.38
 """Height of the eye line above the middle of the picture, in halves of its height."""
-MOUTH_HEIGHT = -0.22
-"""Height of the mouth line; a wide open jaw still ends inside the picture."""
+MOUTH_HEIGHT = -0.26
+"""Height of the mouth line; the lower lip of a wide open jaw still lies inside the picture."""
 CAMERA_DISTANCE = 0.60
 """Metres from the camera to the plane of the face."""
 HALF_HEIGHT = 0.112

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from reenact.checkpoint import load_checkpoint, load_tensors, save_tensors
 from reenact.config import Config, load_config, save_config
-from reenact.data import Studio, identity_grid
+from reenact.data import Studio
 from reenact.errors import ReenactError
 from reenact.layout import find_layout
 from reenact.models import Networks
@@ -27,7 +27,7 @@ from reenact.rigs.files import load_clip, load_rig, save_rig
 from reenact.rigs.rig import Rig
 
 _LAYOUT_RESOLUTION = 64
-"""Pixels at which layouts are found; enlarged to the networks' resolution."""
+"""Pixels at which layouts are found; a studio enlarges them to the resolution of its pictures."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,8 @@ class Run:
         clip = None if clip_name is None else load_clip(clip_name, self.rigs[key])
         return Studio(
             self.rigs[key],
-            config.images.resolution,
-            config.images.residual,
-            _resized(self.layouts.get(key), config.images.resolution),
+            config.images,
+            self.layouts.get(key),
             clip,
             config.training.fixed_frames,
             seed=1000 * config.training.seed + index,
@@ -142,12 +141,3 @@ def _new_folder(rigs: list[Rig]) -> Path:
     while (Path("runs") / f"{base}-{number}").exists():
         number += 1
     return Path("runs") / f"{base}-{number}"
-
-
-def _resized(grid: Tensor | None, resolution: int) -> Tensor | None:
-    """A layout at another resolution: positions are relative, so the smooth displacement is interpolated."""
-    if grid is None or len(grid) == resolution:
-        return grid
-    displacement = (grid - identity_grid(len(grid))).permute(2, 0, 1)[None]
-    fine = torch.nn.functional.interpolate(displacement, size=(resolution, resolution), mode="bicubic")
-    return identity_grid(resolution) + fine[0].permute(1, 2, 0)
