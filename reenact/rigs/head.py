@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import sparse
+from scipy.interpolate import PchipInterpolator
 
 from reenact.rigs import makehuman
 
@@ -23,7 +24,7 @@ REFERENCE = {
 }
 """MakeHuman's default human, on which its face units close the eyes."""
 
-NECK_HEIGHT, NECK_SLOPE = 0.581, -0.22
+NECK_HEIGHT, NECK_SLOPE = 0.588, -0.28
 """The neck is cut by the plane y = height + slope z, metres in the base mesh: lower under the chin than at the nape."""
 
 
@@ -94,8 +95,8 @@ def load_head() -> Head:
     reference = reference_vertices()[coarse]
 
     operator, faces = _cut(coarse_faces, height[coarse])
-    for wanted in (_near_paint, _near_brows):
-        operator, faces = _split(operator, faces, wanted(operator @ reference, operator @ masks["lips"]))
+    for wanted in (_on_any_edge_of_paint, _on_sharp_edge_of_paint):
+        operator, faces = _split(operator, faces, wanted(operator @ reference, operator @ masks["lips"], faces))
     eyes = {side: fit_eyeball(reference_vertices(), side) for side in ("left", "right")}
     lids = {side: _lid_pairs(reference, coarse_faces, masks["sockets"], eyes[side][0]) for side in eyes}
     return Head(
@@ -169,7 +170,7 @@ def _split(operator: sparse.csr_matrix, faces: np.ndarray, wanted: np.ndarray) -
     """Halves all edges of the wanted triangles, and splits their neighbours so that no crack opens.
 
     Args:
-        wanted: (V,) vertices; a triangle is wanted when all of its corners are.
+        wanted: (F,) triangles.
     """
     corner_edges = np.sort(
         np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1), axis=2
@@ -177,7 +178,7 @@ def _split(operator: sparse.csr_matrix, faces: np.ndarray, wanted: np.ndarray) -
     edges, edge_of = np.unique(corner_edges.reshape(-1, 2), axis=0, return_inverse=True)
     edge_of = edge_of.reshape(-1, 3)  # edge opposite each corner
     halved = np.zeros(len(edges), dtype=bool)
-    halved[edge_of[wanted[faces].all(1)]] = True
+    halved[edge_of[wanted]] = True
     midpoint = np.full(len(edges), -1)
     midpoint[halved] = operator.shape[0] + np.arange(halved.sum())
     middle = (operator[edges[halved, 0]] + operator[edges[halved, 1]]) * 0.5
@@ -205,22 +206,58 @@ def _drop_unused(operator: sparse.csr_matrix, faces: np.ndarray) -> tuple[sparse
     return operator[used], compact.reshape(-1, 3)
 
 
-def _near_paint(points: np.ndarray, lips: np.ndarray) -> np.ndarray:
-    """Where paint has an edge: brows, lips."""
-    mouth = (np.abs(points[:, 0]) < 0.034) & (np.abs(points[:, 1] - points[lips > 0.5, 1].mean()) < 0.02)
-    return brow_box(points, margin=0.006) | (mouth & (lips > 0.01))
+def _on_any_edge_of_paint(points: np.ndarray, lips: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Triangles that touch the brows, or that the hairline or the edge of the lips crosses."""
+    lips = lips[faces]
+    on_lips_edge = (lips.max(1) > 0.2) & (lips.min(1) < 0.8) & (lips.max(1) - lips.min(1) > 0.1)
+    near_brows = np.abs(above_brows(points))[faces].min(1) < 0.006
+    return near_brows | on_lips_edge | _crosses_hairline(points, faces)
 
 
-def _near_brows(points: np.ndarray, lips: np.ndarray) -> np.ndarray:
-    return brow_box(points, margin=0.001)
+def _on_sharp_edge_of_paint(points: np.ndarray, lips: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Brows, and the hairline over the forehead."""
+    forehead = points[faces][:, :, 2].mean(1) > 0.075
+    return (np.abs(above_brows(points))[faces].min(1) < 0.004) | (_crosses_hairline(points, faces) & forehead)
 
 
-def brow_box(points: Float[np.ndarray, "V 3"], margin: float) -> Bool[np.ndarray, "V"]:
-    """Where eyebrows may grow on the reference head."""
-    center, radius = fit_eyeball(reference_vertices(), "left")
-    side, up = np.abs(points[:, 0]) - center[0], points[:, 1] - center[1]
-    front = points[:, 2] > center[2] - radius
-    return front & (np.abs(side + 0.001) < 0.026 + margin) & (np.abs(up - 0.0205) < 0.0085 + margin)
+def _crosses_hairline(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    hair = above_hairline(points)[faces]
+    return (hair.min(1) < 0.003) & (hair.max(1) > -0.002)
+
+
+# ---- lines on the reference head, which paint and refinement share ----
+
+HAIRLINE = (
+    # degrees from straight ahead, height above the eyes in metres
+    (0, 0.068), (25, 0.068), (45, 0.062), (60, 0.046), (70, 0.016), (78, -0.002), (88, -0.006), (100, 0.004),
+    (115, -0.026), (140, -0.056), (180, -0.062),
+)  # fmt: skip
+BROW_LINE = (
+    # distance from the middle of the face, height above the eyes, metres
+    (0.008, 0.0190), (0.014, 0.0196), (0.022, 0.0214), (0.032, 0.0232), (0.038, 0.0228), (0.046, 0.0196),
+    (0.052, 0.0160),
+)  # fmt: skip
+
+
+def above_hairline(points: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V"]:
+    """Height over the hairline, metres; negative on the face and the nape."""
+    eye, _ = fit_eyeball(reference_vertices(), "left")
+    degrees = np.degrees(np.abs(np.arctan2(points[:, 0], points[:, 2] - 0.02)))
+    return points[:, 1] - eye[1] - _curve(degrees, HAIRLINE)
+
+
+def above_brows(points: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V"]:
+    """Height over the middle of the eyebrows, metres; infinite beside and behind them."""
+    eye, radius = fit_eyeball(reference_vertices(), "left")
+    outward = np.abs(points[:, 0])
+    beside = (
+        (outward < BROW_LINE[0][0] - 0.003) | (outward > BROW_LINE[-1][0] + 0.003) | (points[:, 2] < eye[2] - radius)
+    )
+    return np.where(beside, np.inf, points[:, 1] - eye[1] - _curve(outward, BROW_LINE))
+
+
+def _curve(values: np.ndarray, table: tuple) -> np.ndarray:
+    return PchipInterpolator(*np.array(table).T)(np.clip(values, table[0][0], table[-1][0]))
 
 
 # ---- contacts ----

@@ -54,6 +54,7 @@ def triangles(mesh: BaseMesh, group: str) -> Int[np.ndarray, "F 3"]:
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
+@cache
 def group_vertices(group: str) -> Int[np.ndarray, "N"]:
     """Vertices of a group of the base mesh."""
     return np.unique(triangles(read_base_mesh(), group))
