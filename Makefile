@@ -40,7 +40,7 @@ $(READY): pyproject.toml constraints.txt
 # stopped one goes on. To start over, remove the folder.
 demo: $(RUN)/trained $(RUN)/speech.glb $(RUN)/speech.csv $(RUN)/evaluation/metrics.json
 	@echo
-	@echo "Report      $(RUN)/evaluation/report.html"
+	@echo "Report      $(RUN)/report.html"
 	@echo "Animation   $(RUN)/speech.glb (opens in any glTF viewer), $(RUN)/speech.csv"
 	@echo "Numbers     $(RUN)/evaluation/metrics.json"
 	@echo "Previews    $(RUN)/previews"

@@ -123,32 +123,29 @@ def convert(
 ) -> None:
     """Turn a rig or a clip into another format.
 
-    Rigs: built-in names, .glb and .npz to .glb and .npz. Clips: .csv, .npz, .glb and synthetic:SEED[:SECONDS] to .csv,
-    .npz and .glb, which need --rig, the rig that they move.
+    Rigs: built-in names, .glb and .npz to .glb and .npz. Clips: .csv, .npz and .glb to .csv and .npz; with --rig also
+    synthetic:SEED[:SECONDS], and to .glb.
 
     Args:
         input: A file, a built-in rig, or with --rig a clip.
         output: File to write, in the format of its suffix.
-        rig: Read IN as a clip of this rig: a built-in name or a file. Writing .glb puts the rig in, animated.
+        rig: Read IN as a clip of this rig, a built-in name or a file: the clip gets its shapes, and in .glb its mesh.
     """
-    from reenact.rigs.files import load_clip, load_rig, save_clip, save_rig
+    from reenact.rigs.files import load_clip, load_rig, read_clip, save_clip, save_rig
 
-    if rig is not None:
-        _check_out(output, _CLIP_FILES)
-        moved_rig = load_rig(rig)
-        clip = load_clip(input, moved_rig)
-        save_clip(clip, output, moved_rig)
-        print(f"{output}: {len(clip)} frames, {clip.duration:.1f} s, {len(clip.names)} blendshapes")
+    if rig is None and not _is_clip(input, output):
+        _check_out(output, _RIG_FILES)
+        loaded = load_rig(input)
+        save_rig(loaded, output)
+        print(f"{output}: {len(loaded.neutral)} vertices, {len(loaded.faces)} faces, {len(loaded.names)} blendshapes")
         return
-    if ".csv" in (Path(input).suffix.lower(), output.suffix.lower()) or input.startswith("synthetic:"):
-        raise ReenactError(f"{input}: expected --rig RIG beside a clip, got none; name the rig that the clip moves")
-    _check_out(output, _RIG_FILES)
-    loaded = load_rig(input)
-    save_rig(loaded, output)
-    print(
-        f"{output}: {len(loaded.neutral)} vertices, {len(loaded.faces)} faces, {len(loaded.names)} blendshapes: "
-        f"{', '.join(loaded.names[:4])}{', ...' if len(loaded.names) > 4 else ''}"
-    )
+    _check_out(output, _CLIP_FILES)
+    if rig is None and (input.startswith("synthetic:") or output.suffix.lower() == ".glb"):
+        raise ReenactError(f"{input}: expected --rig beside this clip, got none; name the rig that it moves")
+    moved = None if rig is None else load_rig(rig)
+    clip = read_clip(input) if moved is None else load_clip(input, moved)
+    save_clip(clip, output, moved)
+    print(f"{output}: {len(clip)} frames, {clip.duration:.1f} s, {len(clip.names)} blendshapes")
 
 
 def rigs(
@@ -246,6 +243,16 @@ def _run_config(run: Path | str) -> Path:
             f"{run}: expected a run folder with config.toml in it, got none; `reenact train` makes one"
         )
     return path
+
+
+def _is_clip(input: str, output: Path) -> bool:
+    """Whether a conversion is of a clip; a .glb may hold both, and is a rig unless its clip is asked for."""
+    from reenact.rigs.formats import npz
+
+    path = Path(input)
+    if path.suffix.lower() == ".npz" and path.is_file():
+        return "weights" in npz.contents(path)
+    return ".csv" in (path.suffix.lower(), output.suffix.lower()) or input.startswith("synthetic:")
 
 
 def _check_out(path: Path, suffixes: tuple[str, ...]) -> None:

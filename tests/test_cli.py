@@ -1,0 +1,311 @@
+"""The commands: help, one sentence for a mistake, exit status."""
+
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from reenact import cli
+from reenact.cli import main
+from reenact.config import Config, config_to_dict, save_config
+from reenact.errors import ReenactError
+from reenact.rigs.clip import Clip
+from reenact.rigs.files import load_clip, load_rig, save_clip, save_rig
+
+ROOT = Path(__file__).parents[1]
+
+
+def fails(capsys, *arguments):
+    """The sentence that a mistake is answered with."""
+    assert main([str(argument) for argument in arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1, "one sentence on one line"
+    return err.removeprefix("error: ").removesuffix("\n")
+
+
+def explained(capsys, *arguments):
+    with pytest.raises(SystemExit) as done:
+        main(list(arguments))
+    assert done.value.code == 0
+    return " ".join(capsys.readouterr().out.replace("│", " ").split())
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Calls that reach the training, which does not run."""
+    from reenact import training
+
+    calls = []
+    monkeypatch.setattr(training, "train", lambda config, resume=False: calls.append((config, resume)))
+    return calls
+
+
+def test_help_names_every_command(capsys):
+    text = explained(capsys, "--help")
+    assert all(f"• {name}" in text for name in cli.COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (
+            "train",
+            ["--config FILE.toml", "--resume", "--run", "--source", "--target", "--source-clip", "--target-clip"],
+        ),
+        ("train", ["--training.steps INT", "Optimizer steps of ReenactNet.", "--images.no-residual", "{found,none}"]),
+        ("infer", ["infer [-h] RUN CLIP --out FILE [--reverse]", "Live Link Face"]),
+        ("evaluate", ["evaluate [-h] RUN [RUN ...]", "--frames INT", "--seed INT", "(one or more)"]),
+        ("convert", ["convert [-h] IN OUT [--rig RIG]"]),
+        ("rigs", ["--out FILE.png", "--size INT"]),
+    ],
+)
+def test_help_of_each_command_is_complete(command, words, capsys):
+    text = explained(capsys, command, "--help")
+    assert [word for word in words if word not in text] == []
+
+
+def test_help_of_train_names_every_setting_and_its_default(capsys):
+    text = explained(capsys, "train", "--help")
+    for section, value in config_to_dict(Config()).items():
+        for key, default in value.items() if isinstance(value, dict) else [("", value)]:
+            option = f"{section}.{key}".rstrip(".").replace("_", "-")
+            found = re.search(rf"--{option}(, --\S+)? (\S+)( (?!--)\S+)*? \(default: {re.escape(str(default))}\)", text)
+            assert found, option
+
+
+@pytest.mark.parametrize("script", ["train", "infer", "evaluate"])
+def test_scripts_are_the_same_commands(script):
+    done = subprocess.run(
+        [sys.executable, ROOT / f"{script}.py", "--help"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0
+    assert f"usage: reenact {script}" in done.stdout
+
+
+def test_help_does_not_load_what_takes_seconds_to_load():
+    code = (
+        "import sys, reenact.cli\n"
+        "try: reenact.cli.main(['train', '--help'])\n"
+        "except SystemExit: print([m for m in ('torch', 'numba', 'scipy', 'kornia') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_settings_come_from_defaults_then_the_file_then_the_command_line(trained, tmp_path):
+    (tmp_path / "x.toml").write_text(
+        "source = 'a.glb'\n[training]\nsteps = 7\nbatch_size = 3\n[images]\nresidual = false"
+    )
+    arguments = [
+        "train",
+        "--config",
+        f"{tmp_path / 'x.toml'}",
+        "--training.steps",
+        "9",
+        "--training.learning-rate",
+        "1e-4",
+    ]
+    assert main(arguments) == 0
+    training = replace(Config().training, steps=9, batch_size=3, learning_rate=1e-4)
+    expected = replace(Config(), source="a.glb", training=training, images=replace(Config().images, residual=False))
+    assert trained == [(expected, False)]
+
+
+def test_both_spellings_of_an_option_are_read(trained, tmp_path):
+    (tmp_path / "x.toml").write_text("source = 'a.glb'")
+    assert main(["train", f"--config={tmp_path / 'x.toml'}", "--training.batch_size=4"]) == 0
+    config, _ = trained[0]
+    assert (config.source, config.training.batch_size) == ("a.glb", 4)
+
+
+def test_a_resumed_run_takes_its_own_settings(trained, tmp_path):
+    saved = replace(Config(), source="a.glb", run="moved/since", training=replace(Config().training, steps=5))
+    save_config(saved, tmp_path / "config.toml")
+    assert main(["train", "--run", f"{tmp_path}", "--resume"]) == 0
+    assert trained == [(replace(saved, run=f"{tmp_path}"), True)]
+
+
+def test_a_resumed_run_refuses_other_settings(trained, tmp_path, capsys):
+    save_config(Config(), tmp_path / "config.toml")
+    sentence = fails(capsys, "train", "--run", tmp_path, "--resume", "--training.steps", 9, "--source", "b")
+    assert sentence.startswith(
+        f"{tmp_path}: expected the settings that the run began with, got other source, training.steps; "
+    )
+    assert trained == []
+
+
+def test_resuming_needs_a_run(trained, tmp_path, capsys):
+    assert fails(capsys, "train", "--resume").startswith("--resume: expected the folder of a run beside it, got none")
+    sentence = fails(capsys, "train", "--resume", "--run", tmp_path / "none")
+    assert sentence.startswith(f"{tmp_path / 'none'}: expected a run folder with config.toml in it, got none")
+    assert trained == []
+
+
+def test_wrong_settings_are_one_sentence(trained, tmp_path, capsys):
+    (tmp_path / "x.toml").write_text("[training]\nstesp = 7")
+    sentence = fails(capsys, "train", "--config", tmp_path / "x.toml")
+    assert sentence == f"{tmp_path / 'x.toml'}: unknown key training.stesp; did you mean training.steps?"
+    assert "none.toml: there is no such settings file" in fails(capsys, "train", "--config", tmp_path / "none.toml")
+    sentence = fails(capsys, "train", "--images.resolution", 72)
+    assert sentence == "command line: images.resolution: expected a multiple of 16, from 16 to 1024, got 72"
+    assert trained == []
+
+
+def test_an_unknown_option_names_the_nearest(trained, capsys):
+    with pytest.raises(SystemExit) as done:
+        main(["train", "--training.stesp", "7"])
+    assert done.value.code == 2
+    assert "--training.steps" in capsys.readouterr().err
+    assert trained == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["infer", "{run}", "c.csv", "--out", "out.mp4"], "out.mp4: expected a name that ends in .csv or .npz or .glb"),
+        (
+            ["infer", "{run}", "c.csv", "--out", "out"],
+            "out: expected a name that ends in .csv or .npz or .glb, got no suf",
+        ),
+        (
+            ["infer", "{run}", "c.csv", "--out", "no/where/out.csv"],
+            "no/where/out.csv: the folder no/where does not exist",
+        ),
+        (["infer", "{run}/none", "c.csv", "--out", "out.csv"], "{run}/none: expected a run folder with config.toml"),
+        (["evaluate", "{run}/none"], "{run}/none: expected a run folder with config.toml in it, got none"),
+        (["evaluate"], "evaluate: expected at least one run folder, got none"),
+        (["convert", "{run}/rig.npz", "{run}/folder.glb"], "{run}/folder.glb: expected a file to write, got a folder"),
+        (["convert", "{run}/rig.npz", "rig.obj"], "rig.obj: expected a name that ends in .glb or .npz, got .obj"),
+        (["convert", "{run}/none.npz", "rig.glb"], "{run}/none.npz: no such file"),
+        (["convert", "anny:mna", "rig.glb"], "anny:mna: no such character; did you mean anny:man?"),
+        (["convert", "synthetic:1:1", "{run}/c.csv"], "synthetic:1:1: expected --rig beside this clip, got none"),
+        (["convert", "{run}/clip.npz", "{run}/c.glb"], "{run}/clip.npz: expected --rig beside this clip, got none"),
+        (["rigs", "--out", "{run}/rigs.jpg"], "{run}/rigs.jpg: expected a name that ends in .png, got .jpg"),
+        (["rigs", "--size", "5"], "--size: expected 16 to 1024 pixels, got 5"),
+    ],
+)
+def test_a_mistake_is_one_sentence_before_any_work(arguments, sentence, tmp_path, toy_rig, capsys):
+    save_config(Config(), tmp_path / "config.toml")
+    save_rig(toy_rig, tmp_path / "rig.npz")
+    save_clip(Clip(toy_rig.names, torch.zeros(2, len(toy_rig.names)), 30.0), tmp_path / "clip.npz")
+    (tmp_path / "folder.glb").mkdir()
+    arguments = [argument.format(run=tmp_path) for argument in arguments]
+    assert fails(capsys, *arguments).startswith(sentence.format(run=tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "text"),
+    [
+        (ReenactError("[red]x.glb[/red]: as it is"), 2, "error: [red]x.glb[/red]: as it is\n"),
+        (PermissionError(13, "Permission denied", "a/b"), 2, "error: a/b: Permission denied\n"),
+        (OSError(28, "No space left on device"), 2, "error: No space left on device\n"),
+        (KeyboardInterrupt(), 130, "stopped: by the keyboard\n"),
+    ],
+)
+def test_errors_of_the_user_and_the_machine_are_one_line(error, status, text, monkeypatch, capsys):
+    def fail():
+        raise error
+
+    monkeypatch.setitem(cli.COMMANDS, "rigs", fail)
+    assert main(["rigs"]) == status
+    assert capsys.readouterr().err == text
+
+
+def test_our_own_mistakes_keep_their_traceback(monkeypatch):
+    def fail():
+        raise RuntimeError("ours")
+
+    monkeypatch.setitem(cli.COMMANDS, "rigs", fail)
+    with pytest.raises(RuntimeError, match="ours"):
+        main(["rigs"])
+
+
+def test_warnings_are_one_line_each(monkeypatch, capsys):
+    import warnings
+
+    monkeypatch.setitem(cli.COMMANDS, "rigs", lambda: warnings.warn("a shape stays at 0", stacklevel=1))
+    assert main(["rigs"]) == 0
+    assert capsys.readouterr().err == "warning: a shape stays at 0\n"
+
+
+def test_rigs_survive_conversion_to_glb_and_back(toy_rig, tmp_path, capsys):
+    save_rig(toy_rig, tmp_path / "a.npz")
+    assert main(["convert", f"{tmp_path / 'a.npz'}", f"{tmp_path / 'b.glb'}"]) == 0
+    assert main(["convert", f"{tmp_path / 'b.glb'}", f"{tmp_path / 'c.npz'}"]) == 0
+    assert capsys.readouterr().out.count("642 vertices, 1280 faces, 7 blendshapes") == 2
+    again = load_rig(f"{tmp_path / 'c.npz'}")
+    assert again.names == toy_rig.names
+    # GLB may order vertices anew; the posed corners of the triangles are what must stay. float32 in both files.
+    weights = torch.linspace(0, 1, len(toy_rig.names))
+    corners, corners_again = (rig.vertices(weights)[rig.faces] for rig in (toy_rig, again))
+    torch.testing.assert_close(corners_again, corners, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("with_rig", [False, True])
+def test_clips_survive_conversion_through_every_format(with_rig, toy_rig, tmp_path):
+    weights = torch.rand(12, len(toy_rig.names), generator=torch.Generator().manual_seed(1))
+    clip = Clip(toy_rig.names, weights, 30.0)
+    save_rig(toy_rig, tmp_path / "rig.npz")
+    save_clip(clip, tmp_path / "a.table.csv")
+    rig = ["--rig", f"{tmp_path / 'rig.npz'}"]
+    chain = ["a.table.csv", "b.npz", "c.glb", "d.npz", "e.csv"]
+    for source, target in pairwise(chain):
+        options = rig if with_rig or target == "c.glb" else []
+        # From .glb without a rig: only a .csv says that the clip is meant, not the rig.
+        options = rig if source == "c.glb" else options
+        assert main(["convert", f"{tmp_path / source}", f"{tmp_path / target}", *options]) == 0
+    for name in chain:
+        again = load_clip(f"{tmp_path / name}", toy_rig)
+        assert again.fps == pytest.approx(30, abs=1e-3)  # time stamps in .csv have milliseconds or so
+        torch.testing.assert_close(again.weights, weights, rtol=0, atol=2e-4)  # digits of a Live Link Face .csv
+
+
+def test_the_clip_of_a_glb_goes_to_csv_without_a_rig(toy_rig, tmp_path):
+    weights = torch.eye(len(toy_rig.names))
+    save_clip(Clip(toy_rig.names, weights, 30.0), tmp_path / "a.glb", toy_rig)
+    assert main(["convert", f"{tmp_path / 'a.glb'}", f"{tmp_path / 'b.csv'}"]) == 0
+    torch.testing.assert_close(load_clip(f"{tmp_path / 'b.csv'}", toy_rig).weights, weights, rtol=0, atol=2e-4)
+
+
+def test_a_clip_made_by_formula_is_written_for_a_rig(toy_rig, tmp_path, capsys):
+    save_rig(toy_rig, tmp_path / "rig.npz")
+    assert main(["convert", "synthetic:3:1", f"{tmp_path / 'c.npz'}", "--rig", f"{tmp_path / 'rig.npz'}"]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'c.npz'}: 30 frames, 1.0 s, 7 blendshapes\n"
+
+
+def test_rigs_are_listed_and_drawn(toy_pair, tmp_path, monkeypatch, capsys):
+    from reenact.rigs import anny, files
+
+    cast = {"anny:ball": "round", "anny:egg": "tall"}
+    monkeypatch.setattr(anny, "BUILT_IN", cast)
+    monkeypatch.setattr(files, "load_rig", dict(zip(cast, toy_pair, strict=True)).__getitem__)
+    assert main(["rigs", "--out", f"{tmp_path / 'x.png'}", "--size", "32"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in lines[:2]] == [["anny:ball", "round"], ["anny:egg", "tall"]]
+    with Image.open(tmp_path / "x.png") as sheet:
+        assert sheet.size == (6 * 32, 2 * (32 + 16))  # neutral and five expressions; a line of text over each row
+        neutral, moved = (sheet.crop((32 * k, 16, 32 * k + 32, 48)) for k in (0, 2))
+        assert neutral.tobytes() != moved.tobytes()
+
+
+def test_the_console_script_exits_with_the_status():
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}"}
+    done = subprocess.run(
+        [sys.executable, "-m", "reenact.cli", "rigs", "--size", "1"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: --size: expected 16 to 1024 pixels, got 1\n"
