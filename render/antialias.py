@@ -70,7 +70,7 @@ def _crossings(
 ):
     """Where silhouette edge p, q of a face with third vertex o separates two pixels."""
     height, width = inverse_img.shape
-    # A steep edge is met by pixel rows, a shallow one by columns: "t" is the column (row) at the given row (column) "s".
+    # Pixel rows meet a steep edge, columns a shallow one: "t" is the column (row) where row (column) "s" meets it.
     steep = bool((pixels[q, 1] - pixels[p, 1]).abs() > (pixels[q, 0] - pixels[p, 0]).abs())
     along, across = (0, 1) if steep else (1, 0)
     if pixels[p, across] > pixels[q, across]:
@@ -80,7 +80,9 @@ def _crossings(
         return
     surface_is_before = bool(pixels[o, along] < t0 + (t1 - t0) / (s1 - s0) * (pixels[o, across] - s0))
     last_s, last_t = (height - 1, width - 1) if steep else (width - 1, height - 1)
-    for s in range(max(math.ceil(s0), 0), min(math.ceil(s1), last_s + 1)):  # without s1: the next edge takes it
+    for s in range(
+        max(math.ceil(s0.item()), 0), min(math.ceil(s1.item()), last_s + 1)
+    ):  # without s1: the next edge takes it
         fraction = (s - s0) / (s1 - s0)
         t = t0 + fraction * (t1 - t0)
         if not 0 <= t < last_t:

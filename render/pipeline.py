@@ -137,7 +137,7 @@ def render_by_stages(
     uv: Float[Tensor, "V 2"] | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> dict[str, Tensor]:
-    """Colour, mask and normals as `render` makes them, one readable stage after the other and thousands of times slower.
+    """Colour, mask and normals as `render` makes them, one readable stage after the other, thousands of times slower.
 
     For reading, and for testing the compiled kernels; gradients are those of autograd.
     """
