@@ -172,7 +172,7 @@ class _Table:
     first: np.ndarray  # (G,) a shape of each unit
     second: np.ndarray  # (G,) its other side, where `paired`
     paired: np.ndarray  # (G,) bool
-    together: np.ndarray  # (G,) bool: never on one side only
+    together: np.ndarray  # (G,) bool: no sides, or never on one side only
     frequency: np.ndarray  # (G,) relative chance of being active
     opposed: np.ndarray  # (E, 2)
     correctives: tuple[tuple[int, int], ...]
@@ -216,7 +216,12 @@ def _table(names: tuple[str, ...]) -> _Table:
         first=np.array(first),
         second=np.array([partner.get(index, 0) for index in first]),
         paired=np.array([index in partner for index in first]),
-        together=np.array([bool(name) and name[0].startswith("eyeLook") for name in canon]),
+        together=np.array(
+            [
+                index not in partner or (bool(name) and name[0].startswith("eyeLook"))
+                for index, name in zip(first, canon)
+            ]
+        ),
         frequency=np.array([2.0 if name and name[0].startswith("eyeBlink") else 1.0 for name in canon], np.float32),
         opposed=np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2),
         correctives=tuple(
@@ -296,7 +301,9 @@ _EMOTIONS = {
 
 
 def _blend(times: np.ndarray, starts: np.ndarray, widths: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Track (T, K) that goes to values[i] around starts[i], by half a cosine of that width."""
+    """Track (T, K) that goes to values[i] around starts[i], by half a cosine of that width; 0 before."""
+    if len(starts) == 0:  # a clip that ends before anything begins
+        return np.zeros((len(times), len(arkit.NAMES)))
     phase = ((times[:, None] - starts) / widths + 0.5).clip(0, 1)  # (T, E)
     arrived = 0.5 - 0.5 * np.cos(np.pi * phase)
     arrived = np.minimum.accumulate(arrived, axis=1)  # a wide blend is not overtaken by the next one
@@ -372,8 +379,6 @@ def _brow_beats(times: np.ndarray, rng: Generator) -> np.ndarray:
         starts += [now, now + float(rng.uniform(0.2, 0.5))]
         values += [rng.uniform(0.4, 1.2) * kinds[int(rng.integers(len(kinds)))], _VISEMES["sil"]]
         now = starts[-1] + float(rng.exponential(1.3)) + 0.3
-    if not starts:
-        return np.zeros((len(times), len(arkit.NAMES)))
     return _blend(times, np.array(starts), np.full(len(starts), 0.18), np.array(values))
 
 
