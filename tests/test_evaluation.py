@@ -178,15 +178,19 @@ def test_lid_closure_of_known_openings(lid_rig):
     )  # float32
     scores = evaluation.lid_closure(lid_rig, predicted, truth, pairs)
     assert scores["error"] == pytest.approx(1.05 / 7, rel=1e-5)
+    assert scores["blinks"] == 2
     assert scores["blink_f1"] == pytest.approx(2 / 3)  # one of two found, none invented: precision 1, recall 1/2
 
 
 def test_lip_contact_of_known_gaps(lid_rig):
+    shut = torch.tensor([[0.0, 0.001, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    lips = Rig("lips", shut, -lid_rig.deltas, ("open",), lid_rig.faces)
     pairs = torch.tensor([[0, 1]])
-    truth = torch.tensor([[1.0], [0.0], [0.0], [1.0]])
-    predicted = torch.tensor([[0.9], [0.0], [1.0], [1.0]])
-    scores = evaluation.lip_contact(lid_rig, predicted, truth, pairs, face_height=10.0)
+    truth = torch.tensor([[0.0], [1.0], [1.0], [0.0]])
+    predicted = torch.tensor([[0.1], [1.0], [0.0], [0.0]])
+    scores = evaluation.lip_contact(lips, predicted, truth, pairs, face_height=10.0)
     assert scores["gap_error"] == pytest.approx(1.1 / 40, rel=1e-5)
+    assert scores["contacts"] == 2
     assert scores["contact_f1"] == pytest.approx(2 / 3)  # one event found; precision 1, recall 1/2
 
 
@@ -410,8 +414,8 @@ def test_contacts_are_scored_where_they_are_known(rigs, monkeypatch):
     pairs = {key: torch.tensor([[2 * i, 2 * i + 1]]) for i, key in enumerate(("lids_left", "lids_right", "lips"))}
     monkeypatch.setattr(evaluation, "_contacts", lambda rig: pairs)
     truth = run(rigs, copy, frames=18)[0]["truth"]
-    assert truth["lids"] == {"error": 0, "blink_f1": 1}
-    assert truth["lips"] == {"gap_error": 0, "contact_f1": 1}
+    assert truth["lids"] == {"error": 0, "blink_f1": 1, "blinks": 0}
+    assert truth["lips"] == {"gap_error": 0, "contact_f1": 1, "contacts": truth["lips"]["contacts"]}
 
 
 def test_contacts_are_left_out_where_they_are_unknown(perfect):
