@@ -134,7 +134,7 @@ class _Document:
             raise self.fail(f"expected {key}[{index}] as an object, got {str(items[index])[:40]!r}")
         return items[index]
 
-    def numbers(self, owner: dict[str, Any], key: str, count: int, where: str, default: list[float]) -> np.ndarray:
+    def numbers(self, owner: dict[str, Any], key: str, count: int, where: str, default: list[Any]) -> np.ndarray:
         values = self.get(owner, key, list, where, default)
         good = all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
         if len(values) != count or not good or not all(abs(value) < 1e30 for value in values):
