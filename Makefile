@@ -38,7 +38,7 @@ $(READY): pyproject.toml constraints.txt
 
 # Each step of the demo makes a file, and is skipped once the file is there: a finished run is not trained again, a
 # stopped one goes on. To start over, remove the folder.
-demo: $(RUN)/trained $(RUN)/speech.glb $(RUN)/speech.csv $(RUN)/evaluation/metrics.json
+demo: $(RUN)/trained $(RUN)/speech.glb $(RUN)/speech.csv $(RUN)/report.html
 	@echo
 	@echo "Report      $(RUN)/report.html"
 	@echo "Animation   $(RUN)/speech.glb (opens in any glTF viewer), $(RUN)/speech.csv"
@@ -54,7 +54,7 @@ $(RUN)/trained: | $(READY)
 $(RUN)/speech.glb $(RUN)/speech.csv: $(RUN)/trained
 	@$(BIN)/python infer.py "$(RUN)" synthetic:2026:12 --out "$@"
 
-$(RUN)/evaluation/metrics.json: $(RUN)/trained
+$(RUN)/report.html: $(RUN)/trained
 	@$(BIN)/python evaluate.py "$(RUN)"
 
 test: $(READY)

@@ -271,11 +271,11 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
     """What one evaluation found, for the terminal."""
     from rich.table import Table
 
-    columns = {"retargeted": numbers, "without ReenactNet": numbers["direct"]}
+    columns = {"retargeted": numbers, "direct": numbers["direct"]}
     columns |= {name.replace("_", " "): row for name, row in numbers["baselines"].items()}
     title = f"{numbers['run']}: {numbers['source']} -> {numbers['target']}, {numbers['frames']} unseen frames"
-    compared = Table(title=title, title_justify="left")
-    compared.add_column("")
+    compared = Table(title=title, title_justify="left", caption="direct: without ReenactNet", caption_justify="left")
+    compared.add_column("", no_wrap=True)
     for name in columns:
         compared.add_column(name, justify="right")
     measures = {"truth": ("ver", "wmae", "correlation", "gain"), "cyclic": ("mae", "ssim", "mae_masked", "skill")}
@@ -283,9 +283,9 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
         for name in names:
             values = [(row[group] or {}).get(name) for row in columns.values()]
             compared.add_row(f"{group}.{name}", *map(_number, values))
-    alone = Table(title="BPNet on the target's own pictures, and speed", title_justify="left")
-    for name in ("", "value"):
-        alone.add_column(name, justify="right" if name else "left")
+    alone = Table(title="BPNet alone; speed", title_justify="left")
+    alone.add_column("", no_wrap=True)
+    alone.add_column("value", justify="right")
     for group, names in {
         "bpnet": ("wmae", "ver", "psnr", "ssim"),
         "speed": ("fps", "latency_ms_p50", "latency_ms_p99"),
@@ -302,7 +302,7 @@ def _number(value: float | None) -> str:
 
 
 def _draw_rigs(names: list[str], size: int, out: Path) -> None:
-    """A row per rig: name, neutral, expressions."""
+    """A row per rig: name, neutral, and the strongest moments of a clip of emotions."""
     import torch
     from PIL import Image, ImageDraw, ImageFont
 
@@ -314,7 +314,9 @@ def _draw_rigs(names: list[str], size: int, out: Path) -> None:
     sheet = Image.new("RGB", (size * (1 + count), (size + label) * len(names)), "white")
     for row, name in enumerate(names):
         rig = load_rig(name)
-        weights = torch.cat([torch.zeros(1, len(rig.names)), motion.expressions(rig.names, count, seed=11)])
+        emotions = motion.synthesize(rig.names, 20.0, seed=1, kind="emotion").weights
+        peaks = [stretch[stretch.sum(1).argmax()] for stretch in emotions.chunk(count)]
+        weights = torch.stack([torch.zeros(len(rig.names)), *peaks])
         pictures = Portrait.of(rig).render(rig.vertices(weights), size)["color"]
         top = row * (size + label)
         ImageDraw.Draw(sheet).text(
