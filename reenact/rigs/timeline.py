@@ -28,32 +28,34 @@ def steady(
     """
     if len(times) == 0:
         raise ReenactError(f"{where}: expected at least one frame, got none")
-    if not np.isfinite(times).all():
-        raise ReenactError(f"{where}: times must be finite, row {int((~np.isfinite(times)).argmax()) + 1} is not")
+    sound = np.abs(times) < 1e12
+    if not sound.all():
+        raise ReenactError(f"{where}: times must be finite, row {int((~sound).argmax()) + 1} is not")
     order = np.argsort(times, kind="stable")
     times, weights = times[order], weights[order]
-    steps = np.diff(times)
-    if not (steps > 0).any():
-        return weights[-1:], single
-    step = float(np.median(steps[steps > 0]))
-    last_of_each = np.append(steps > 0.25 * step, True)
-    times, weights = times[last_of_each], weights[last_of_each]
-    if len(times) == 1:
-        return weights, single
     with np.errstate(over="ignore"):
+        steps = np.diff(times)
+        if not (steps > 0).any():
+            return weights[-1:], single
+        step = float(np.quantile(steps[steps > 0], 0.5, method="lower"))
+        last_of_each = np.append(steps > 0.25 * step, True)
+        times, weights = times[last_of_each], weights[last_of_each]
+        if len(times) == 1:
+            return weights, single
         span = float(times[-1] - times[0])
         even = span / (len(times) - 1)
         evenly = np.abs(times - times[0] - even * np.arange(len(times))).max() < 0.02 * even
         fps = 1 / (even if evenly else step)
-        if round(fps) > 0 and abs(fps - round(fps)) < 0.002 * fps:
-            fps = float(round(fps))
-        drift = abs(span * fps - (len(times) - 1))  # in frames, after rounding the rate
-        if not np.isfinite(fps) or span * fps > 20 * len(times) + 1000:
-            raise ReenactError(
-                f"{where}: expected about one row per frame, got {len(times)} rows over {span:.6g} s at {fps:.6g} fps; "
-                "check the times"
-            )
-    if evenly and drift < 0.1:
+        whole = float(round(min(max(fps, 1), 1e6)))
+        # Even samples stay as they are: the whole rate must fit them to a tenth of a frame up to the last.
+        if abs(fps - whole) < 0.002 * whole and not (evenly and abs(span * whole - len(times) + 1) > 0.1):
+            fps = whole
+    if fps > 1e6 or span * fps > 20 * len(times) + 1000:
+        raise ReenactError(
+            f"{where}: expected about one row per frame, got {len(times)} rows over {span:.6g} s at {fps:.6g} fps; "
+            "check the times"
+        )
+    if evenly:
         return weights, fps
     grid = times[0] + np.arange(round(span * fps) + 1) / fps
     return np.stack([np.interp(grid, times, column) for column in weights.T], axis=1), fps

@@ -129,7 +129,7 @@ def load_npz(path: Path) -> Clip:
     if len(weights) == 0:
         raise ReenactError(f"{path}: expected at least one frame in weights, got none")
     if "fps" in arrays:
-        fps = float(npz.floats(path, arrays, "fps", ()))
+        fps = float(npz.floats(path, arrays, "fps", (), np.float64))
         return Clip(names, torch.from_numpy(weights), fps)
     if "time" not in arrays:
         raise ReenactError(f"{path}: expected an array time or fps beside weights, got neither")
