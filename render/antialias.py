@@ -103,8 +103,8 @@ def edges_of(faces: Int[Tensor, "F 3"]) -> Int[Tensor, "E 4"]:
     Where more than two faces share an edge, the third and later ones each get the edge once more to themselves.
     """
     count = len(faces)
-    ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(1).values  # (3 F, 2)
-    owners = torch.arange(count, device=faces.device).repeat(3)
+    ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).sort(1).values  # (3 F, 2)
+    owners = torch.arange(count, device=faces.device).repeat_interleave(3)
     order = torch.argsort(ends[:, 0] * (int(faces.max()) + 1) + ends[:, 1], stable=True)
     ends, owners = ends[order], owners[order]
     starts = torch.ones(3 * count, dtype=torch.bool, device=faces.device)

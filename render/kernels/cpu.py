@@ -15,6 +15,7 @@ pixel       column, row, of which the centre of pixel (0, 0) is the origin
 
 from __future__ import annotations
 
+import inspect
 import math
 
 import numba
@@ -23,8 +24,17 @@ import numpy as np
 BACKGROUND = -1
 LEFT_OR_ABOVE, RIGHT_OR_BELOW = 0, 1  # where the silhouette's own surface lies within a pair of pixels
 
-_compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
-_inlined = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "ninf", "nsz", "arcp", "contract"})
+_APPROXIMATE = {"nnan", "ninf", "nsz", "arcp", "contract"}
+
+
+def _compiled(function):
+    # An import hook that checks types, as in our tests, wraps every function; the compiler needs the bare one.
+    return numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
+
+
+def _inlined(function):
+    """For arithmetic that may be reordered; not where two faces must agree to the last bit."""
+    return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_APPROXIMATE)(inspect.unwrap(function))
 
 
 @_inlined
