@@ -55,7 +55,9 @@ class ReenactNetConfig:
     seed_channels: int = 96
     """Channels of the small picture that the code is unfolded to."""
     decoder_channels: int = 16
-    """Channels of the decoder's last block; doubled at each earlier one."""
+    """Half the channels of the decoder's last block; doubled at each earlier one."""
+    decoder_blocks: int = 2
+    """Doublings of the decoder, of three, with a block of their own; the third takes two thirds of the time."""
     kernel: int = 3
     """Width of the encoder's convolutions."""
     normalize: bool = True

@@ -48,7 +48,7 @@ class ReenactNet(nn.Module):
             nn.Unflatten(1, (seed, small, small)),
             layer.up(seed, seed),
         )
-        self.decoders = nn.ModuleDict({key: _decoder(seed, config.decoder_channels, layer, residual) for key in keys})
+        self.decoders = nn.ModuleDict({key: _decoder(seed, config, layer, residual) for key in keys})
 
     def encode(self, pictures: Float[Tensor, "B C R R"]) -> Float[Tensor, "B A Rs Rs"]:
         """The expression, unfolded to a small picture that every decoder understands: E."""
@@ -115,18 +115,19 @@ class _Residual(nn.Module):
         return self.finish(x + self.body(x))
 
 
-def _decoder(seed: int, channels: int, layer: _Layer, residual: bool) -> nn.Sequential:
-    """Three doublings from R / 8 to R; the last convolution is linear for residuals, a sigmoid for colours."""
-    return nn.Sequential(
-        layer.up(seed, 8 * channels),
-        layer.residual(8 * channels),
-        layer.up(8 * channels, 4 * channels),
-        layer.residual(4 * channels),
-        layer.up(4 * channels, 2 * channels),
-        layer.residual(2 * channels),
-        nn.Conv2d(2 * channels, 3, 1),
-        nn.Identity() if residual else nn.Sigmoid(),
-    )
+def _decoder(seed: int, config: ReenactNetConfig, layer: _Layer, residual: bool) -> nn.Sequential:
+    """Three doublings from R / 8, the last without blocks of their own; linear for residuals, sigmoid for colours."""
+    blocks, size = [], seed
+    for index in range(config.decoder_blocks):
+        wide = config.decoder_channels * 2 ** (config.decoder_blocks - index)
+        blocks += [layer.up(size, wide), layer.residual(wide)]
+        size = wide
+    rest = 2 ** (3 - config.decoder_blocks)
+    if rest == 1:
+        blocks.append(nn.Conv2d(size, 3, 1))
+    else:
+        blocks += [nn.Conv2d(size, 3 * rest * rest, 3, 1, 1), nn.PixelShuffle(rest)]
+    return nn.Sequential(*blocks, nn.Identity() if residual else nn.Sigmoid())
 
 
 def parameter_count(module: nn.Module) -> int:
