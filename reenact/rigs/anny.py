@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -167,6 +168,7 @@ CAST: dict[str, Character] = {
         shapes={
             "head/head-round": 1.0,
             "eyes/*-eye-bag-decr": 1.0,
+            "eyebrows/eyebrows-angle-up": 0.6,
             "eyes/*-eye-height1-incr": 0.7,
             "eyes/*-eye-height2-incr": 1.0,
             "eyes/*-eye-height3-incr": 0.7,
@@ -177,11 +179,12 @@ CAST: dict[str, Character] = {
         warp=(
             Bump("neck", scale=(0.72, 1.0, 0.72), inner=0.02, outer=0.11),
             Bump("skull", scale=(1.17, 0.92, 1.04), inner=0.06, outer=0.18),
-            Bump("nose", scale=(0.75, 0.72, 0.62), inner=0.008, outer=0.055),
-            Bump("chin", scale=(1.0, 0.85, 1.0), shift=(0.0, 0.015, 0.0), inner=0.01, outer=0.08),
-            Bump("mouth", scale=(1.25, 1.1, 1.0), inner=0.02, outer=0.10),
-            Bump("corners", shift=(0.0, 0.005, 0.001), inner=0.002, outer=0.04),
-            Bump("eyes", scale=(1.55, 1.55, 1.55), shift=(0.004, 0.003, -0.004), inner=0.017, outer=0.065),
+            Bump("nose", scale=(0.75, 0.75, 0.65), shift=(0.0, 0.003, 0.0), inner=0.008, outer=0.05),
+            Bump("chin", scale=(1.0, 0.85, 1.0), shift=(0.0, 0.012, 0.0), inner=0.006, outer=0.055),
+            Bump("eyes", scale=(1.25, 1.25, 1.25), shift=(0.003, 0.003, -0.003), inner=0.016, outer=0.072),
+            Bump("eyes", scale=(1.36, 1.36, 1.36), shift=(0.003, 0.002, -0.004), inner=0.020, outer=0.056),
+            Bump("mouth", scale=(1.3, 1.25, 1.0), inner=0.02, outer=0.09),
+            Bump("corners", shift=(0.0, 0.004, 0.001), inner=0.002, outer=0.04),
         ),
         palette=Palette(
             skin=(0.96, 0.76, 0.55),
@@ -196,7 +199,7 @@ CAST: dict[str, Character] = {
             tongue=(0.86, 0.40, 0.44),
             mouth=(0.38, 0.08, 0.12),
         ),
-        brow_thickness=1.5,
+        brow_thickness=2.0,
         brow_lift=0.001,
         teeth_width=0.76,
         iris_size=1.1,
@@ -364,7 +367,7 @@ def _assemble(name: str, character: Character) -> Rig:
     reference, units = heads.reference_vertices(), _read_units(character.units)
     full = _sculpt(character)
     offsets = _transfer_units(character, head, reference, full, units)
-    eyes = {side: heads.fit_eyeball(full, side) for side in ("left", "right")}
+    eyes = {side: _seat_eyeball(head, full, side) for side in ("left", "right")}
     neutral, skin_offsets = full[head.coarse], {shape: offset[head.coarse] for shape, offset in offsets.items()}
     _keep_contacts(head, neutral, skin_offsets, eyes)
     retraction = {side: _clear_eyeball(head, neutral, skin_offsets, side, *eyes[side]) for side in eyes}
@@ -551,6 +554,19 @@ def _personal_ranges(character: Character, names: tuple[str, ...], points: np.nd
     return ranges
 
 
+LID_CLEARANCE = 0.0001
+"""Metres between lids and eyeball."""
+
+
+def _seat_eyeball(head: heads.Head, full: np.ndarray, side: str) -> tuple[np.ndarray, float]:
+    """Centre and radius of an eyeball, set back until the edges of the lids lie in front of it."""
+    center, radius = heads.fit_eyeball(full, side)
+    rim = full[head.coarse[head.lids[side].ravel()]]
+    while np.linalg.norm(rim - center, axis=1).min() < radius + LID_CLEARANCE:
+        center = center - np.array([0, 0, 0.00005])
+    return center, radius
+
+
 def _clear_eyeball(
     head: heads.Head, neutral: np.ndarray, offsets: dict[str, np.ndarray], side: str, center: np.ndarray, radius: float
 ) -> dict[str, np.ndarray]:
@@ -564,17 +580,16 @@ def _clear_eyeball(
     """
     blink = next(name for name in BLINKS[side] if name in offsets)
     offset = offsets[blink]
-    near = np.linalg.norm(neutral - center, axis=1) < 1.6 * radius
-    watch = head.operator[np.flatnonzero(((head.operator @ near) > 0) & (head.masks["sockets"] < 0.02))]
-    away = neutral + offset - center
+    rest, away = neutral - center, neutral + offset - center
     distance = np.linalg.norm(away, axis=1, keepdims=True)
-    moving = np.linalg.norm(offset, axis=1, keepdims=True) > 1e-4
-    lid = (np.linalg.norm(neutral - center, axis=1, keepdims=True) > radius) & moving & (away[:, 2:] > 0)
-    offset += np.where(lid & (distance < 1.03 * radius), away / distance * (1.03 * radius - distance), 0)
-    for retract in np.arange(0.0, 0.008, 0.00025):
+    in_front = np.linalg.norm(rest, axis=1) >= radius + LID_CLEARANCE
+    lid = in_front & (np.linalg.norm(offset, axis=1) > 1e-4) & (rest[:, 2] > 0) & (away[:, 2] > 0)
+    shut = lid[:, None] & (distance < 1.02 * radius)
+    offset += np.where(shut, away / distance * (1.02 * radius - distance), 0)
+    path = [(weight, (rest + weight * offset)[lid]) for weight in (0.25, 0.5, 0.75, 1.0)]
+    for retract in np.arange(0.0, 0.3 * radius, 0.0001):
         back = np.array([0, 0, -retract])
-        posed = [(weight, watch @ (neutral + weight * offset)) for weight in (0.25, 0.5, 0.75, 1.0)]
-        if all(np.linalg.norm(points - center - weight * back, axis=1).min() > radius for weight, points in posed):
+        if all(np.linalg.norm(points - weight * back, axis=1).min() > radius for weight, points in path):
             break
     return {blink: back}
 
@@ -815,4 +830,5 @@ def _write_cache(path: Path, rig: Rig) -> None:
             np.savez(file, names=np.array(rig.names), **arrays)
         os.replace(partial, path)
     except OSError:  # A full or read-only disk costs time, not the result.
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 
 class Transfer:
-    """Carries offsets from one neutral to another; the matrix is factored once."""
+    """Carries offsets from one neutral to another; what the source leaves in place stays in place on the target."""
 
     def __init__(
         self,
@@ -32,23 +32,23 @@ class Transfer:
         fixed: Int[np.ndarray, "R"],
     ):
         """Args: fixed: Vertices that never move; every connected piece of the mesh needs one."""
-        self.source, self.faces = source, faces
+        self.source, self.faces, self.fixed = source, faces, fixed
         self.source_frames = np.linalg.inv(_frames(source, faces))
         start, end = faces, np.roll(faces, -1, axis=1)  # (F, 3) edges a->b, b->c, c->a
         self.target_edges = target[end] - target[start]  # (F, 3, 3)
-        weights = _cotangents(target, faces)  # (F, 3)
-        self.incidence = _incidence(start.ravel(), end.ravel(), len(source))
-        self.weights = sparse.diags(weights.ravel())
-        self.free = np.setdiff1d(np.arange(len(source)), fixed)
-        laplacian = (self.incidence.T @ self.weights @ self.incidence).tocsc()[self.free][:, self.free]
-        self.solve = splu(laplacian.tocsc()).solve
+        incidence = _incidence(start.ravel(), end.ravel(), len(source))
+        self.divergence = (incidence.T @ sparse.diags(_cotangents(target, faces).ravel())).tocsr()
+        self.laplacian = (self.divergence @ incidence).tocsr()
 
     def __call__(self, offsets: Float[np.ndarray, "V 3"]) -> Float[np.ndarray, "V 3"]:
         """The same motion on the target."""
         gradients = _frames(self.source + offsets, self.faces) @ self.source_frames
-        wanted = np.einsum("fij,fej->fei", gradients - np.eye(3), self.target_edges).reshape(-1, 3)
+        wanted = (self.target_edges @ (gradients - np.eye(3)).transpose(0, 2, 1)).reshape(-1, 3)
+        free = np.setdiff1d(np.flatnonzero((offsets != 0).any(1)), self.fixed)
         result = np.zeros_like(offsets)
-        result[self.free] = self.solve((self.incidence.T @ (self.weights @ wanted))[self.free])
+        if len(free):
+            system = self.laplacian[free][:, free].tocsc()
+            result[free] = splu(system).solve(self.divergence[free] @ wanted)
         return result
 
 
