@@ -31,6 +31,7 @@ def test_halves_of_a_split_shape_are_the_shape():
 def test_a_merged_pair_stands_for_both_sides_and_spells_neither():
     assert arkit.meaning("eyeBlink") == ("eyeBlinkLeft", "eyeBlinkRight")
     assert arkit.canonical("eyeBlink") is None
+    assert arkit.meaning("eyeLookLeft") == ("eyeLookOutLeft", "eyeLookInRight")
     assert arkit.meaning("jaw") == ()  # jawLeft and jawRight are opposites, not a pair
 
 

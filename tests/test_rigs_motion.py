@@ -99,6 +99,8 @@ def test_split_and_merged_rigs_keep_the_rules():
     weights = motion.expressions(split, 4000, seed=3).numpy()
     assert np.corrcoef(weights[:, 0], weights[:, 1])[0, 1] > 0.5
     assert (weights[:, 3] <= weights[:, 2]).all()
+    gaze = motion.expressions(("eyeLookLeft", "eyeLookRight", "jawOpen"), 4000, seed=3).numpy()
+    assert (gaze[:, 0] * gaze[:, 1]).max() < motion.BOTH
     assert motion.expressions(MERGED, 4000, seed=3).numpy().max(0).min() > 0.9
 
 

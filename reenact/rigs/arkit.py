@@ -85,7 +85,11 @@ def canonical(name: str) -> str | None:
 
 @lru_cache(maxsize=4096)
 def meaning(name: str) -> tuple[str, ...]:
-    """The ARKit shapes that a shape's name stands for: one, none, or both sides of a merged pair (`eyeBlink`)."""
+    """The ARKit shapes that a shape's name stands for: one, none, or two that are merged.
+
+    Merged are both sides of a pair (`eyeBlink`), and both eyes looking one way (`eyeLookLeft`: the left eye out, the
+    right eye in).
+    """
     for spelling in (name, re.split(r"[.:|]", name)[-1]):
         key = re.sub(r"[^a-z0-9]", "", spelling.lower())
         if key in _SPELLINGS:
@@ -105,6 +109,8 @@ def _spellings() -> dict[str, tuple[str, ...]]:
         base = left.removesuffix("Left").lower()
         for both in ("", "both", "lr"):
             spellings[base + both] = (left, right)
+    spellings["eyelookleft"] = ("eyeLookOutLeft", "eyeLookInRight")
+    spellings["eyelookright"] = ("eyeLookOutRight", "eyeLookInLeft")
     for name in SPLIT:
         for side in ("left", "right", "l", "r"):
             spellings[name.lower() + side] = (name,)

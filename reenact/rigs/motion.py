@@ -191,11 +191,12 @@ def _table(names: tuple[str, ...]) -> _Table:
     for left, right in yoked.items():
         if len(known.get(left, ())) == len(known.get(right, ())) == 1 and known[left] != known[right]:
             partner[known[left][0]] = known[right][0]
-    apart = {name for pair in arkit.DIRECTIONS for name in pair}
+    # Sides in these names are directions, or belong to the partner just found.
+    apart = {name for pair in arkit.DIRECTIONS for name in pair} | set(yoked) | set(yoked.values())
     left_of = {}
     for index, name in enumerate(names):
         base, side = arkit.sides(name)
-        if side == "left" and arkit.canonical(name) not in (apart | yoked.keys()):
+        if side == "left" and not apart.intersection(arkit.meaning(name)):
             left_of[base] = index
     for index, name in enumerate(names):
         base, side = arkit.sides(name)
