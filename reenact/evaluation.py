@@ -25,6 +25,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.optimize import lsq_linear
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
@@ -280,6 +281,51 @@ def common_shapes(source: tuple[str, ...], target: tuple[str, ...]) -> tuple[lis
     return [i for i, _ in pairs], [j for _, j in pairs]
 
 
+def true_weights(
+    source: Rig, target: Rig, weights: Float[Tensor, "T Ks"]
+) -> tuple[Float[Tensor, "T Ks"], Float[Tensor, "T Kt"], list[int]]:
+    """What the target should do, as far as names tell.
+
+    Between rigs that share names the same shapes get the same weights. A merged character (`anny:merged`) shares names
+    but not ranges, and stands for the full set that it was made from by a known matrix: from it the weights are those
+    of the full set, to it they are the bounded least-squares fit to the full set's vertices.
+
+    Returns:
+        The source's weights with every shape at rest whose meaning the target does not know; the target's weights;
+        and the indices of the target's shapes that the truth covers, none where the rigs share no name.
+    """
+    full_source, source_matrix = _unmerged(source)
+    full_target, _ = _unmerged(target)
+    here, there = common_shapes(full_source.names, full_target.names)
+    partnered = torch.zeros(len(full_source.names), dtype=torch.bool)
+    partnered[here] = True
+    known = weights.clone()
+    known[:, source_matrix[~partnered].abs().sum(0) > 0] = 0
+    truth = torch.zeros(len(weights), len(full_target.names))
+    truth[:, there] = (known @ source_matrix.T)[:, here]
+    if full_target is target:
+        return known, truth.clamp(0, 1), there
+    return known, _fit(full_target, truth, target), list(range(len(target.names))) if there else []
+
+
+def _unmerged(rig: Rig) -> tuple[Rig, Tensor]:
+    """The rig whose shapes a merged character combines, and the matrix (K_full, K) of weights; or the rig itself."""
+    if rig.name.startswith("anny:"):
+        from reenact.rigs import anny
+
+        if rig.name in anny.CAST and anny.CAST[rig.name].merged:
+            return anny.before_merging(rig.name), anny.merged_matrix()[2]
+    return rig, torch.eye(len(rig.names))
+
+
+def _fit(full: Rig, weights: Tensor, target: Rig) -> Tensor:
+    """Weights in [0, 1] of `target` whose vertices lie closest to those of `full`, which has the same vertices."""
+    basis, triangle = torch.linalg.qr(target.deltas.flatten(1).double().T)  # (3 V, K), (K, K)
+    wanted = weights.double() @ (full.deltas.flatten(1).double() @ basis)  # (T, K)
+    rows = [lsq_linear(triangle.numpy(), row.numpy(), (0, 1)).x for row in wanted]
+    return torch.from_numpy(np.stack(rows)).float()
+
+
 # ---------------------------------------------------------------------------------------------------------------------
 # Pictures
 
@@ -308,21 +354,22 @@ def image_ssim(pictures: Float[Tensor, "B C H W"], truth: Float[Tensor, "B C H W
 
     Source: Wang et al. 2004, through scikit-image.
     """
-    scores = [
-        structural_similarity(
-            a.permute(1, 2, 0).cpu().numpy(),
-            b.permute(1, 2, 0).cpu().numpy(),
-            channel_axis=-1,
-            data_range=1.0,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-            K1=0.01,
-            K2=0.03,
-        )
-        for a, b in zip(pictures, truth)
-    ]
-    return torch.tensor(scores, dtype=torch.float64)
+    count, channels, height, width = pictures.shape
+    edge = 5  # half of the window, which scikit-image leaves out: so stacked pictures do not see each other
+    tall = [values.permute(0, 2, 3, 1).reshape(-1, width, channels).cpu().numpy() for values in (pictures, truth)]
+    _, similarity = structural_similarity(
+        *tall,
+        full=True,
+        channel_axis=-1,
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        K1=0.01,
+        K2=0.03,
+    )
+    inner = similarity.reshape(count, height, width, channels)[:, edge:-edge, edge:-edge]
+    return torch.from_numpy(inner.mean((1, 2, 3), dtype=np.float64))
 
 
 def psnr(pictures: Float[Tensor, "B C H W"], truth: Float[Tensor, "B C H W"]) -> float:
@@ -424,9 +471,9 @@ def evaluate_retargeters(
     Returns:
         Numbers, nested:
 
-        - `truth`: `ver` with its 95 % interval `ver_interval`, `ve_mm`, and `weight_metrics` against the weights that
-          the rigs' shared names call right; `lids`, `lips` where the target's contacts are known. None where the rigs
-          share no name. Source shapes without a partner are left at rest here, so that the truth is known.
+        - `truth`: `ver` with its 95 % interval `ver_interval`, `ve_mm`, and `weight_metrics` against `true_weights`,
+          which the rigs' shared names call right; `lids`, `lips` where the target's contacts are known. None where the
+          rigs share no name. Source shapes without a partner are left at rest here, so that the truth is known.
         - `cyclic`: source -> target -> source, pictures of the recovered weights against the original ones: `mae`,
           `ssim`, `mae_masked`, `skill`; and `wmae`, `ver`, `correlation` on the source rig. Needs no truth, hence works
           for any two rigs. Its trap: two networks that smuggle the source's weights through a meaningless target
@@ -479,15 +526,11 @@ def evaluate_retargeters(
     }
 
     say("comparing with the truth")
-    truth_source, truth_target = common_shapes(source.names, target.names)
+    known, truth, covered = true_weights(source, target, weights)
     true: dict[str, dict[str, Any]] = {}
     decoded, shapes, worst = None, [], []
     arrays: dict[str, np.ndarray] = {}
-    if truth_source:
-        known = torch.zeros_like(weights)
-        known[:, truth_source] = weights[:, truth_source]
-        truth = torch.zeros(len(weights), len(target.names))
-        truth[:, truth_target] = weights[:, truth_source]
+    if covered:
         answers, pictures = {"reenact": predicted, "direct": direct}, cycle.pictures
         if not torch.equal(known, weights):  # shapes without a partner would move the target in unknown ways
             pictures = _in_chunks(forward.source_pictures, known)
@@ -501,7 +544,7 @@ def evaluate_retargeters(
         contacts = _contacts(target)
         true = {
             name: {
-                kind: _true(target, answer, truth, truth_target, span, list(kinds.values()), contacts)
+                kind: _true(target, answer, truth, covered, span, list(kinds.values()), contacts)
                 for kind, span in _spans(kinds)
             }
             for name, answer in answers.items()
@@ -514,9 +557,7 @@ def evaluate_retargeters(
         worst = error.argsort(descending=True).tolist()
         shapes = [
             {"name": target.names[j], **row}
-            for j, row in zip(
-                truth_target, per_shape(answers["reenact"][:, truth_target], truth[:, truth_target]), strict=True
-            )
+            for j, row in zip(covered, per_shape(answers["reenact"][:, covered], truth[:, covered]), strict=True)
         ]
         arrays = {
             "truth": truth.numpy(),
@@ -540,7 +581,7 @@ def evaluate_retargeters(
         "target": target.name,
         "frames": len(weights),
         "seed": seed,
-        "shared_shapes": len(truth_source),
+        "shared_shapes": len(covered),
         **summary("reenact", "all"),
         "bpnet": bpnet,
         "decoded": decoded,

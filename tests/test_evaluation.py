@@ -10,6 +10,7 @@ import types
 import numpy as np
 import pytest
 import torch
+from skimage.metrics import structural_similarity
 
 from reenact import evaluation
 from reenact.errors import ReenactError
@@ -257,6 +258,52 @@ def test_common_shapes_meet_across_spellings_and_exact_names():
     assert evaluation.common_shapes(("a",), ("b",)) == ([], [])
 
 
+def test_a_rig_that_shares_all_names_should_copy():
+    source, target = make_rig("left", seed=1), make_rig("right", NAMES[::-1], seed=2)
+    weights = torch.rand(4, len(NAMES), generator=torch.Generator().manual_seed(0))
+    known, truth, covered = evaluation.true_weights(source, target, weights)
+    assert torch.equal(known, weights)
+    assert torch.equal(truth, weights.flip(1))
+    assert covered == list(range(len(NAMES)))
+
+
+@pytest.fixture
+def merged(monkeypatch):
+    """A pair of rigs of which one merges shapes of the other: a known matrix instead of shared ranges."""
+    full = make_rig("anny:full", NAMES, seed=4)
+    matrix = torch.zeros(len(NAMES), 3)
+    matrix[0, 0], matrix[1, 1], matrix[2, 1], matrix[5, 2] = 0.5, 1.0, 1.0, 2.0
+    names = ("jawOpen", "eyeBlink", "browInnerUp")
+    rig = Rig("anny:part", full.neutral, torch.einsum("km,kvc->mvc", matrix, full.deltas), names, full.faces)
+    monkeypatch.setattr(
+        evaluation,
+        "_unmerged",
+        lambda rig: (full, matrix) if rig.name == "anny:part" else (rig, torch.eye(len(rig.names))),
+    )
+    return rig, matrix
+
+
+def test_a_merged_source_stands_for_the_shapes_it_was_made_from(merged):
+    rig, matrix = merged
+    weights = 0.5 * torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
+    _, truth, covered = evaluation.true_weights(rig, make_rig("right", seed=2), weights)
+    torch.testing.assert_close(truth, weights @ matrix.T)
+    assert len(covered) == len(NAMES)
+
+
+def test_a_merged_target_gets_the_weights_that_show_the_same_face_not_the_same_numbers(merged):
+    rig, matrix = merged
+    expected = 0.5 * torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
+    _, truth, covered = evaluation.true_weights(make_rig("left", seed=1), rig, expected @ matrix.T)
+    torch.testing.assert_close(truth, expected, rtol=0, atol=1e-5)  # float32 deltas
+    assert covered == [0, 1, 2]
+    strong = torch.zeros(1, len(NAMES))
+    strong[0, 0] = 1.0  # would need a weight of 2
+    truth = evaluation.true_weights(make_rig("left", seed=1), rig, strong)[1]
+    assert float(truth.max()) <= 1
+    assert float(truth[0, 0]) > 0.99
+
+
 # Pictures ------------------------------------------------------------------------------------------------------------
 
 
@@ -288,6 +335,23 @@ def test_masked_mae_sees_only_the_mask():
     mask[0, :, :4] = 1
     assert evaluation.masked_mae(picture, black, mask).tolist() == pytest.approx([0.4, 0.0])
     assert float(evaluation.image_mae(picture, black)[0]) == pytest.approx(0.2)
+
+
+def test_ssim_of_a_batch_is_that_of_scikit_image_picture_by_picture():
+    first, second = torch.rand(2, 3, 3, 20, 14, generator=torch.Generator().manual_seed(0))
+    expected = [
+        structural_similarity(
+            a.permute(1, 2, 0).numpy(),
+            b.permute(1, 2, 0).numpy(),
+            channel_axis=-1,
+            data_range=1.0,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+        )
+        for a, b in zip(first, second)
+    ]
+    assert evaluation.image_ssim(first, second).tolist() == pytest.approx(expected, rel=1e-6)  # float32 filters
 
 
 def test_ssim_is_symmetric_and_falls_with_noise():
