@@ -11,6 +11,7 @@ previews/            pictures drawn at each save
 from __future__ import annotations
 
 import re
+import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -61,12 +62,16 @@ class Run:
                 layouts[key] = find_layout(
                     keyed[reference], keyed[key], _LAYOUT_RESOLUTION, config.layout, config.training.seed
                 )
-        (folder / "rigs").mkdir(parents=True, exist_ok=True)
-        for index, (key, rig) in enumerate(keyed.items()):
-            save_rig(rig, folder / "rigs" / f"{index}-{key}.npz")
-        save_tensors(layouts, folder / "layouts.safetensors")
         config = replace(config, run=str(folder))
-        save_config(config, folder / "config.toml")  # last: a folder with a config is complete
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as unfinished:
+            whole = Path(unfinished) / "run"
+            (whole / "rigs").mkdir(parents=True)
+            for index, (key, rig) in enumerate(keyed.items()):
+                save_rig(rig, whole / "rigs" / f"{index}-{key}.npz")
+            save_tensors(layouts, whole / "layouts.safetensors")
+            save_config(config, whole / "config.toml")
+            whole.replace(folder)  # a run folder appears whole or not at all; an empty one is taken over
         return cls(folder, config, keyed, layouts)
 
     @classmethod

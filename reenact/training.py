@@ -26,6 +26,7 @@ from torch import Tensor
 from reenact.checkpoint import RunLock, flatten_optimizer, load_checkpoint, restore_optimizer, save_checkpoint
 from reenact.config import Config
 from reenact.data import Studio, jitter
+from reenact.errors import ReenactError
 from reenact.losses import picture_distance, weight_distance
 from reenact.models import Networks
 from reenact.preview import save_preview
@@ -86,7 +87,7 @@ def train(config: Config, resume: bool = False) -> Path:
                     losses = stage.losses(np.random.default_rng(seed), _torch_random(seed))
                     loss = torch.stack(list(losses.values())).sum()
                     if not torch.isfinite(loss):
-                        raise FloatingPointError(
+                        raise ReenactError(
                             f"{run.folder}: the loss of {stage.name} became {loss.item()} at step {step}; "
                             "the last checkpoint is intact, lower the learning rate and train again"
                         )
@@ -230,7 +231,7 @@ def _save(run: Run, networks: Networks, optimizer: torch.optim.Optimizer, stage:
     """`stage` and `step` are where to go on; `total` counts steps over all stages and names the checkpoint."""
     tensors = {f"networks.{name}": tensor for name, tensor in networks.state_dict().items()}
     optimizer_tensors, optimizer_state = flatten_optimizer(optimizer)
-    tensors |= {f"optimizer.{name}": tensor for name, tensor in optimizer_tensors.items()}
+    tensors |= optimizer_tensors
     state = {"stage": stage, "step": step, "optimizer": optimizer_state}
     save_checkpoint(run.folder, total, tensors, state, keep=run.config.training.keep)
 
@@ -246,9 +247,7 @@ def _restore(run: Run, networks: Networks, stages: list[_Stage]) -> tuple[int, i
     if step >= stages[stage].steps:
         return stage + 1, 0, None
     optimizer = _optimizer(run.config, stages[stage])
-    prefix = "optimizer."
-    tensors = {name[len(prefix) :]: t for name, t in checkpoint.tensors.items() if name.startswith(prefix)}
-    restore_optimizer(optimizer, tensors, checkpoint.state["optimizer"])
+    restore_optimizer(optimizer, checkpoint.tensors, checkpoint.state["optimizer"])
     return stage, step, optimizer
 
 

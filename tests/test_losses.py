@@ -1,0 +1,43 @@
+"""Distances are what their formulas say."""
+
+import pytest
+import torch
+
+from reenact.losses import VertexDistance, motion_weight, picture_distance, weight_distance
+
+
+def test_picture_distance_is_the_weighted_mean_absolute_difference():
+    a, b = torch.zeros(1, 1, 2, 2), torch.tensor([[[[1.0, 0.0], [0.0, -3.0]]]])
+    assert picture_distance(a, b) == pytest.approx(1.0)
+    assert picture_distance(a, b, torch.tensor([[[4.0, 1.0], [1.0, 0.0]]])) == pytest.approx(1.0)
+
+
+def test_weight_distance_is_the_mean_over_entries():
+    assert weight_distance(torch.tensor([[0.0, 1.0]]), torch.tensor([[0.5, 1.0]])) == pytest.approx(0.25)
+
+
+def test_vertex_distance_is_the_distance_of_the_vertices(toy_rig):
+    generator = torch.Generator().manual_seed(0)
+    a, b, typical = (torch.rand(5, 7, generator=generator) for _ in range(3))
+    moved = (toy_rig.vertices(a) - toy_rig.vertices(b)).flatten(1).norm(dim=1).mean()
+    unit = (toy_rig.vertices(typical) - toy_rig.neutral).flatten(1).square().sum(1).mean().sqrt()
+    torch.testing.assert_close(VertexDistance(toy_rig, typical)(a, b), moved / unit, rtol=1e-4, atol=0)  # float32
+
+
+def test_vertex_distance_has_a_gradient_where_shapes_are_alike():
+    from conftest import make_toy_rig
+
+    rig = make_toy_rig("twins")
+    rig.deltas[1] = rig.deltas[0]  # two equal shapes: the quadratic form is singular
+    weights = torch.zeros(1, 7, requires_grad=True)
+    VertexDistance(rig, torch.rand(4, 7))(weights, torch.eye(7)[:1]).backward()
+    assert bool(torch.isfinite(weights.grad).all())
+
+
+def test_motion_weight_is_larger_where_pictures_move_and_bounded():
+    residuals = torch.zeros(3, 3, 4, 4)
+    residuals[:, :, 0, 0] = 1.0
+    weight = motion_weight(residuals)
+    assert weight.shape == (1, 4, 4)
+    assert weight[0, 0, 0] == 4.0
+    assert weight[0, 3, 3] == pytest.approx(0.2)

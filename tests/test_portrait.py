@@ -1,0 +1,66 @@
+"""Every rig is photographed with its eyes and mouth on the same rows."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from conftest import make_toy_rig
+
+from reenact.errors import ReenactError
+from reenact.portrait import EYE_HEIGHT, MOUTH_HEIGHT, Portrait, face_lines
+from reenact.rigs import anny
+
+
+@pytest.mark.parametrize("name", sorted(anny.BUILT_IN))
+def test_eye_and_mouth_rows_of_every_character_agree(name):
+    portrait = Portrait.of(anny.build(name))
+    lines = portrait.project(torch.stack(face_lines(portrait.rig)), 64)  # (2, 2) pixels
+    expected = torch.tensor([(1 - EYE_HEIGHT) * 32, (1 - MOUTH_HEIGHT) * 32])
+    torch.testing.assert_close(lines[:, 1], expected, rtol=0, atol=1.5)  # the two lie at different depths
+    torch.testing.assert_close(lines[:, 0], torch.full((2,), 32.0), rtol=0, atol=0.75)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_the_picture_does_not_depend_on_the_unit_of_the_rig(toy_rig, size):
+    scaled = replace(toy_rig, neutral=toy_rig.neutral * size, deltas=toy_rig.deltas * size)
+    weights = torch.eye(len(toy_rig.names))
+    expected = Portrait.of(toy_rig).render(toy_rig.vertices(weights), 48)["color"]
+    actual = Portrait.of(scaled).render(scaled.vertices(weights), 48)["color"]
+    # A vertex may round to the other side of a pixel's middle, never many.
+    assert (actual - expected).abs().mean() < 1e-4
+
+
+def test_lines_are_found_without_parts_and_without_known_names(toy_rig):
+    unnamed = replace(toy_rig, names=tuple(f"shape {k}" for k in range(len(toy_rig.names))))
+    eyes, mouth = face_lines(unnamed)
+    assert eyes[1] > 0.02 > -0.02 > mouth[1]
+
+
+def test_nineteen_numbers_describe_a_portrait(toy_rig):
+    portrait = Portrait.of(toy_rig)
+    assert portrait.parameters.shape == (19,)
+    assert portrait.parameters[15] == pytest.approx(portrait.scale)
+
+
+def test_projection_agrees_with_the_render(toy_rig):
+    portrait = Portrait.of(toy_rig)
+    mask = portrait.render(toy_rig.neutral[None], 64, ("mask",))["mask"][0, 0]
+    rows, columns = (mask > 0.5).nonzero().T
+    projected = portrait.project(toy_rig.neutral, 64)
+    low, high = projected.amin(0), projected.amax(0)
+    assert float(columns.min()) == pytest.approx(float(low[0].clamp_min(0)), abs=1)
+    assert float(columns.max()) + 1 == pytest.approx(float(high[0].clamp_max(64)), abs=1)
+    assert float(rows.min()) == pytest.approx(float(low[1].clamp_min(0)), abs=1)
+
+
+def test_a_face_upside_down_is_named(toy_rig):
+    flip = torch.tensor([-1.0, -1.0, 1.0])
+    with pytest.raises(ReenactError, match="eyes above the mouth"):
+        Portrait.of(replace(toy_rig, neutral=toy_rig.neutral * flip, deltas=toy_rig.deltas * flip))
+
+
+def test_a_rig_that_does_not_move_is_named():
+    still = make_toy_rig("still")
+    still = replace(still, deltas=torch.zeros_like(still.deltas), names=tuple(f"s{k}" for k in range(len(still.names))))
+    with pytest.raises(ReenactError, match="move"):
+        Portrait.of(still)
