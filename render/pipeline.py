@@ -16,7 +16,7 @@ from torch import Tensor
 from render.antialias import antialias
 from render.camera import Camera
 from render.interpolate import barycentrics, interpolate
-from render.kernels.function import Fused, Scene, parts_at_pixels, topology
+from render.kernels.function import Fused, Scene, topology
 from render.rasterize import rasterize
 from render.shade import Light, linear_from_srgb, sample_texture, shade, srgb_from_linear, unit, vertex_normals
 
@@ -89,9 +89,11 @@ def render(
         background=linear_from_srgb(torch.tensor(list(background), dtype=dtype)).numpy(),
         height=height,
         width=width,
+        parts=np.ascontiguousarray(parts.numpy(), dtype=np.int64) if "parts" in buffers else None,
         with_normals="normals" in buffers,
+        with_depth="depth" in buffers,
     )
-    color, mask, normals, inverse_depth, face_img, vertices_camera = Fused.apply(
+    color, mask, normals, inverse_depth, part_img = Fused.apply(
         vertices,
         camera.world_to_camera.to(dtype),
         torch.ones(vertices.shape[1], 3, dtype=dtype) if colors is None else _linear(colors, dtype),
@@ -99,11 +101,10 @@ def render(
         camera.to_camera(light.position.to(dtype)),
         scene,
     )
-    made = {"color": color, "mask": mask, "normals": normals}
-    if "depth" in buffers:
-        made["depth"] = torch.where(face_img[:, None] >= 0, 1 / inverse_depth.clamp(min=1e-30), 0.0)
-    if parts is not None and "parts" in buffers:
-        made["parts"] = parts_at_pixels(vertices_camera, scene, parts, face_img)
+    made = {"color": color, "mask": mask, "normals": normals, "parts": part_img}
+    if inverse_depth is not None:
+        covered = inverse_depth > 0
+        made["depth"] = torch.where(covered, 1 / torch.where(covered, inverse_depth, 1.0), 0.0)
     return {name: made[name] for name in buffers}
 
 

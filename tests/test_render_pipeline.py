@@ -127,6 +127,21 @@ def test_threads_change_neither_picture_nor_gradient(head):
         assert torch.equal(one, two)
 
 
+def test_later_pictures_leave_the_gradient_of_an_earlier_one_alone(scene):
+    # Calls of the same size take turns in the same memory, but not while a gradient may still be asked for.
+    first, second = (scene["vertices"].clone().requires_grad_() for _ in range(2))
+    early = picture(scene, vertices=first)["color"].square().sum()
+    picture(scene, vertices=second * 1.1)["color"].sum().backward()
+    picture(scene, vertices=scene["vertices"] * 0.9)
+    early.backward(retain_graph=True)
+    once = first.grad.clone()
+    early.backward()
+    alone = scene["vertices"].clone().requires_grad_()
+    picture(scene, vertices=alone)["color"].square().sum().backward()
+    assert torch.equal(once, alone.grad)
+    assert torch.equal(first.grad, 2 * alone.grad)
+
+
 def test_an_empty_view_is_background_with_zero_gradient(scene):
     vertices = (scene["vertices"] + torch.tensor([0.0, 0.0, 5.0])).requires_grad_()  # behind the camera
     made = picture(scene, vertices=vertices)

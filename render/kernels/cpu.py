@@ -48,14 +48,11 @@ def _to_camera(world, matrix, vertices):
     """World points in camera space; False if one is not finite."""
     total = vertices.dtype.type(0)
     for v in range(world.shape[0]):
-        for row in range(3):
-            vertices[v, row] = (
-                matrix[row, 0] * world[v, 0]
-                + matrix[row, 1] * world[v, 1]
-                + matrix[row, 2] * world[v, 2]
-                + matrix[row, 3]
-            )
-            total += vertices[v, row]  # NaN and infinity survive every sum
+        x, y, z = world[v, 0], world[v, 1], world[v, 2]
+        vertices[v, 0] = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]
+        vertices[v, 1] = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]
+        vertices[v, 2] = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+        total += vertices[v, 0] + vertices[v, 1] + vertices[v, 2]  # NaN and infinity survive every sum
     return math.isfinite(total)
 
 
@@ -378,11 +375,14 @@ def _encode(blended, color, mask, normals):
 
 @_compiled
 def forward(
-    first, last, world, matrix, faces, edges, colors, uv, uv_faces, texture, light, phong, lens, limits, background,
-    finite, vertices, screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img, blended,
+    worker, first, last, world, matrix, faces, edges, colors, uv, uv_faces, texture, light, phong, lens, limits,
+    background, finite, vertices, screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img, blended,
     color, mask, normals,
 ):  # fmt: skip
-    """Render frames `first` to `last`; `limits` is the near plane and the relative depth margin of silhouettes."""
+    """Render frames `first` to `last`; `limits` is the near plane and the relative depth margin of silhouettes.
+
+    `worker` numbers the thread: it picks scratch memory in `backward`, and is not needed here.
+    """
     for b in range(first, last):
         finite[b] = _to_camera(world[b], matrix, vertices[b])
         if not finite[b]:
@@ -411,11 +411,13 @@ def _encode_backward(blended, color, g_color, g_mask, g_normals, g_blended):
                 slope = number(12.92)
                 if x > number(0.0031308):
                     slope = (color[c, row, column] + number(0.055)) / (number(2.4) * x)
-                g_blended[row, column, c] = slope * g_color[c, row, column] if x > zero and x < one else zero
+                inside = g_color.shape[0] > 0 and x > zero and x < one
+                g_blended[row, column, c] = slope * g_color[c, row, column] if inside else zero
             x = blended[row, column, 3]
-            g_blended[row, column, 3] = g_mask[0, row, column] if x >= zero and x <= one else zero
+            inside = g_mask.shape[0] > 0 and x >= zero and x <= one
+            g_blended[row, column, 3] = g_mask[0, row, column] if inside else zero
             for c in range(4, channels):
-                g_blended[row, column, c] = g_normals[c - 4, row, column]
+                g_blended[row, column, c] = g_normals[c - 4, row, column] if g_normals.shape[0] > 0 else zero
 
 
 @_compiled
@@ -537,7 +539,9 @@ def _shade_backward(
                 g_bk += g_u * uv[uk, 0] + g_v * uv[uk, 1]
 
             # Phong: factor = ambient + diffuse n.l, highlight = specular (r.v) ^ shininess, r.v = 2 n.l n.v - l.v.
-            g_nx, g_ny, g_nz, g_w = zero, zero, zero, -g_inverse[row, column] / (depth * depth)
+            g_nx, g_ny, g_nz, g_w = zero, zero, zero, zero
+            if g_inverse.shape[0] > 0:
+                g_w = -g_inverse[0, row, column] / (depth * depth)
             if n_l > zero:
                 g_n_l, g_n_v, g_l_v = phong[1] * g_factor, zero, zero
                 if r_v > zero and phong[2] > zero:
@@ -655,15 +659,17 @@ def _to_camera_backward(world, matrix, g_vertices, g_world, g_matrix):
 
 @_compiled
 def backward(
-    first, last, world, matrix, faces, edges, colors, uv, uv_faces, texture, light, phong, lens,
+    worker, first, last, world, matrix, faces, edges, colors, uv, uv_faces, texture, light, phong, lens,
     vertices, screen, vertex_normals, face_img, image, pair_img, crossing_img, blended, color,
     g_color, g_mask, g_normals, g_inverse, g_world, g_matrix, g_colors, g_texture, g_light,
+    scratch_blended, scratch_image, scratch_screen, scratch_vertex_normals, scratch_vertices,
 ):  # fmt: skip
-    """Gradients of frames `first` to `last`; all but `g_world` start at 0."""
-    g_vertices = np.empty_like(vertices[0])
-    g_blended, g_image = np.empty_like(image[0]), np.empty_like(image[0])
-    g_screen = np.empty((vertices.shape[1], 2), vertices.dtype)
-    g_vertex_normals = np.empty((vertices.shape[1], 3), vertices.dtype)
+    """Gradients of frames `first` to `last`; all but `g_world` start at 0, and `scratch_...` has one entry a thread.
+
+    A gradient of a picture without channels is zero.
+    """
+    g_blended, g_image, g_screen = scratch_blended[worker], scratch_image[worker], scratch_screen[worker]
+    g_vertex_normals, g_vertices = scratch_vertex_normals[worker], scratch_vertices[worker]
     for b in range(first, last):
         _encode_backward(blended[b], color[b], g_color[b], g_mask[b], g_normals[b], g_blended)
         _blend_backward(image[b], edges, screen[b], pair_img[b], crossing_img[b], g_blended, g_image, g_screen)
@@ -671,7 +677,7 @@ def backward(
         g_vertex_normals[:] = vertices.dtype.type(0)
         _shade_backward(
             vertices[b], faces, colors, uv, uv_faces, texture, light, phong, lens, vertex_normals[b], face_img[b],
-            g_image, g_inverse[b, 0], g_vertices, g_colors[b], g_texture[b], g_light[b], g_vertex_normals,
+            g_image, g_inverse[b], g_vertices, g_colors[b], g_texture[b], g_light[b], g_vertex_normals,
         )  # fmt: skip
         _vertex_normals_backward(vertices[b], faces, vertex_normals[b], g_vertex_normals, g_vertices)
         _project_backward(vertices[b], lens, screen[b], g_screen, g_vertices)
@@ -679,7 +685,7 @@ def backward(
 
 
 @_compiled
-def parts_at_pixels(first, last, vertices, faces, parts, lens, face_img, part_img):
+def parts_at_pixels(worker, first, last, vertices, faces, parts, lens, face_img, part_img):
     """Label of the nearest corner (by barycentric coordinate) of the face in each pixel; -1 on the background."""
     focal = vertices.dtype.type(1) / lens[0]
     for b in range(first, last):

@@ -7,6 +7,7 @@ from collections import OrderedDict, deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -30,66 +31,74 @@ class Scene:
     background: np.ndarray  # linear
     height: int
     width: int
+    parts: np.ndarray | None  # (V,) int64
     with_normals: bool
+    with_depth: bool
 
 
 class Fused(torch.autograd.Function):
     """World vertices, 3 x 4 camera matrix, linear colours and texture, camera-space light -> pictures.
 
-    Returns colour, mask, normals (no channels unless asked for), inverse depth, and the face of each pixel; then the
-    camera-space vertices, for whoever wants to look up more.
+    Returns colour, mask, and those of normals, inverse depth and parts that the scene asks for; None for the others.
     """
 
     @staticmethod
     def forward(
         ctx, world: Tensor, matrix: Tensor, colors: Tensor, texture: Tensor, light: Tensor, scene: Scene
-    ) -> tuple[Tensor, ...]:
-        batch, count, _ = world.shape
+    ) -> tuple[Tensor | None, ...]:
+        batch = len(world)
         height, width = scene.height, scene.width
-        channels = 7 if scene.with_normals else 4
-        new = world.new_empty
-        finite = new(batch, dtype=torch.bool)
-        vertices, screen, vertex_normals = new(batch, count, 3), new(batch, count, 3), new(batch, count, 4)
-        front = new((batch, len(scene.faces)), dtype=torch.uint8)
-        face_img = new((batch, height, width), dtype=torch.int32)
-        inverse_img = new(batch, height, width)
-        image, blended = new(batch, height, width, channels), new(batch, height, width, channels)
-        pair_img, crossing_img = new((batch, 2, height, width), dtype=torch.int32), new(batch, 2, height, width)
-        color, mask = new(batch, 3, height, width), new(batch, 1, height, width)
-        normals = new(batch, channels - 4, height, width)
+        color, mask = world.new_empty(batch, 3, height, width), world.new_empty(batch, 1, height, width)
+        normals = world.new_empty(batch, 3 if scene.with_normals else 0, height, width)
         inputs = [tensor.detach().contiguous() for tensor in (world, matrix, colors, texture, light)]
         limits = np.array([NEAR, DEPTH_MARGIN], scene.lens.dtype)
+        workspace = Workspace.borrow(batch, world.shape[1], scene)
+        kept = workspace.arrays
         over_frames(
             cpu.forward, batch, *_scene_arrays(scene, *inputs), limits, scene.background,
-            finite, vertices, screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img,
-            blended, color, mask, normals,
+            kept["finite"], kept["vertices"], kept["screen"], kept["vertex_normals"], kept["front"], kept["face_img"],
+            kept["inverse_img"], kept["image"], kept["pair_img"], kept["crossing_img"], kept["blended"],
+            color, mask, normals,
         )  # fmt: skip
-        if not bool(finite.all()):
+        if not kept["finite"].all():
             _report_not_finite(world)
-        ctx.scene = scene
-        ctx.save_for_backward(
-            *inputs, vertices, screen, vertex_normals, face_img, image, pair_img, crossing_img, blended, color
-        )
-        ctx.mark_non_differentiable(face_img, vertices)
-        # depth = 1 / inverse_img is left to the caller: few ask for it.
-        return color, mask, normals, inverse_img[:, None], face_img, vertices
+        inverse_img = torch.from_numpy(kept["inverse_img"]).clone()[:, None] if scene.with_depth else None
+        part_img = None
+        if scene.parts is not None:
+            part_img = torch.empty(batch, 1, height, width, dtype=torch.int64)
+            over_frames(
+                cpu.parts_at_pixels, batch, kept["vertices"], scene.faces, scene.parts, scene.lens, kept["face_img"],
+                part_img,
+            )  # fmt: skip
+            ctx.mark_non_differentiable(part_img)
+        if any(ctx.needs_input_grad):
+            ctx.scene, ctx.workspace = scene, workspace
+            ctx.save_for_backward(*inputs, color)
+            ctx.set_materialize_grads(False)
+        return color, mask, normals if scene.with_normals else None, inverse_img, part_img
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, g_color: Tensor, g_mask: Tensor, g_normals: Tensor, g_inverse: Tensor, *_) -> tuple:
-        inputs, buffers = ctx.saved_tensors[:5], ctx.saved_tensors[5:]
+    def backward(ctx, *g_pictures: Tensor | None) -> tuple:
+        *inputs, color = ctx.saved_tensors
         world, _, colors, texture, _ = inputs
+        kept = ctx.workspace.arrays
         _, wants_matrix, wants_colors, wants_texture, wants_light, _ = ctx.needs_input_grad
         batch, zeros = len(world), world.new_zeros
+        nothing = zeros(batch, 0, 0, 0)
         g_world = torch.empty_like(world)
         g_matrix = zeros(batch, 3 if wants_matrix else 0, 4)
         g_colors = zeros(batch, *(colors.shape if wants_colors else (0, 3)))
         g_texture = zeros(batch, *(texture.shape if wants_texture else (0, 0, 3)))
         g_light = zeros(batch, 3)
         over_frames(
-            cpu.backward, batch, *_scene_arrays(ctx.scene, *inputs), *buffers,
-            *(gradient.contiguous() for gradient in (g_color, g_mask, g_normals, g_inverse)),
+            cpu.backward, batch, *_scene_arrays(ctx.scene, *inputs),
+            kept["vertices"], kept["screen"], kept["vertex_normals"], kept["face_img"], kept["image"],
+            kept["pair_img"], kept["crossing_img"], kept["blended"], color,
+            *(nothing if gradient is None else gradient.contiguous() for gradient in g_pictures[:4]),
             g_world, g_matrix, g_colors, g_texture, g_light,
+            kept["scratch_blended"], kept["scratch_image"], kept["scratch_screen"], kept["scratch_vertex_normals"],
+            kept["scratch_vertices"],
         )  # fmt: skip
         # Frames were kept apart up to here, so that the sums do not depend on the threads.
         return (
@@ -100,6 +109,60 @@ class Fused(torch.autograd.Function):
             g_light.sum(0) if wants_light else None,
             None,
         )
+
+
+class Workspace:
+    """What the forward pass leaves for the backward pass, borrowed from those of earlier calls of the same sizes.
+
+    Fresh memory costs as much as all arithmetic (page faults, 160 a frame at 7,000 vertices and 64 pixels). A workspace
+    goes back when the last graph that holds it is gone.
+    """
+
+    _idle: ClassVar[OrderedDict[tuple, list[dict[str, np.ndarray]]]] = OrderedDict()
+    _KINDS_KEPT = 4
+
+    def __init__(self, key: tuple, arrays: dict[str, np.ndarray]) -> None:
+        self._key = key
+        self.arrays = arrays
+
+    @classmethod
+    def borrow(cls, batch: int, vertices: int, scene: Scene) -> Workspace:
+        """A workspace that nobody else uses; its contents are undefined."""
+        number, height, width = scene.lens.dtype, scene.height, scene.width
+        channels = 7 if scene.with_normals else 4
+        workers = os.cpu_count() or 1  # the backward pass may run on more threads than the forward pass
+        key = (batch, vertices, len(scene.faces), height, width, channels, number.str)
+        try:
+            return cls(key, cls._idle[key].pop())
+        except (KeyError, IndexError):
+            pass
+        pixels = (batch, height, width)
+        arrays = {
+            "finite": np.empty(batch, np.bool_),
+            "vertices": np.empty((batch, vertices, 3), number),
+            "screen": np.empty((batch, vertices, 3), number),
+            "vertex_normals": np.empty((batch, vertices, 4), number),
+            "front": np.empty((batch, len(scene.faces)), np.uint8),
+            "face_img": np.empty(pixels, np.int32),
+            "inverse_img": np.empty(pixels, number),
+            "image": np.empty((*pixels, channels), number),
+            "blended": np.empty((*pixels, channels), number),
+            "pair_img": np.empty((batch, 2, height, width), np.int32),
+            "crossing_img": np.empty((batch, 2, height, width), number),
+            "scratch_blended": np.empty((workers, height, width, channels), number),
+            "scratch_image": np.empty((workers, height, width, channels), number),
+            "scratch_screen": np.empty((workers, vertices, 2), number),
+            "scratch_vertex_normals": np.empty((workers, vertices, 3), number),
+            "scratch_vertices": np.empty((workers, vertices, 3), number),
+        }
+        return cls(key, arrays)
+
+    def __del__(self) -> None:
+        idle = self._idle.setdefault(self._key, [])
+        if len(idle) < 2:
+            idle.append(self.arrays)
+        while len(self._idle) > self._KINDS_KEPT:
+            self._idle.popitem(last=False)
 
 
 def _scene_arrays(scene: Scene, world, matrix, colors, texture, light) -> tuple:
@@ -120,44 +183,38 @@ def _report_not_finite(world: Tensor) -> None:
     )
 
 
-def parts_at_pixels(vertices: Tensor, scene: Scene, parts: Tensor, face_img: Tensor) -> Tensor:
-    """Label of the nearest corner of the face in each pixel, -1 on the background: (B, 1, H, W) int64."""
-    part_img = torch.empty(len(vertices), 1, scene.height, scene.width, dtype=torch.int64)
-    over_frames(
-        cpu.parts_at_pixels, len(vertices), vertices, scene.faces, parts.long().contiguous(), scene.lens, face_img,
-        part_img,
-    )  # fmt: skip
-    return part_img
-
-
 _pool: ThreadPoolExecutor | None = None
 
 
 def over_frames(kernel, batch: int, *arrays: np.ndarray | Tensor) -> None:
-    """Run `kernel(first, last, *arrays)` over all frames on as many threads as torch uses."""
+    """Run `kernel(worker, first, last, *arrays)` over all frames on as many threads as torch uses."""
     arrays = tuple(array.numpy() if isinstance(array, Tensor) else array for array in arrays)
-    threads = min(torch.get_num_threads(), batch)
+    threads = min(_worker_count(), batch)
     if threads <= 1:
-        kernel(0, batch, *arrays)
+        kernel(0, 0, batch, *arrays)
         return
     # Small pieces, the calling thread among those who take them: a core that is busy with something else takes fewer.
     bounds = np.linspace(0, batch, min(batch, 4 * threads) + 1).round().astype(int).tolist()
     pieces = deque(pairwise(bounds))
 
-    def work() -> None:
+    def work(worker: int) -> None:
         while True:
             try:
                 first, last = pieces.popleft()
             except IndexError:
                 return
-            kernel(first, last, *arrays)
+            kernel(worker, first, last, *arrays)
 
     if not kernel.signatures:
-        kernel(*pieces.popleft(), *arrays)  # compiles once, not in every thread
-    helpers = [_workers().submit(work) for _ in range(threads - 1)]
-    work()
+        kernel(0, *pieces.popleft(), *arrays)  # compiles once, not in every thread
+    helpers = [_workers().submit(work, worker) for worker in range(1, threads)]
+    work(0)
     for helper in helpers:
         helper.result()
+
+
+def _worker_count() -> int:
+    return max(1, min(torch.get_num_threads(), os.cpu_count() or 1))
 
 
 def _workers() -> ThreadPoolExecutor:
