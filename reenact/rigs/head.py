@@ -215,8 +215,8 @@ def _on_any_edge_of_paint(points: np.ndarray, lips: np.ndarray, faces: np.ndarra
 
 
 def _on_sharp_edge_of_paint(points: np.ndarray, lips: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Brows, and the hairline over the forehead."""
-    forehead = points[faces][:, :, 2].mean(1) > 0.075
+    """Brows, and the hairline as far as it is seen from the front."""
+    forehead = points[faces][:, :, 2].mean(1) > 0.045
     return (np.abs(above_brows(points))[faces].min(1) < 0.004) | (_crosses_hairline(points, faces) & forehead)
 
 
