@@ -25,7 +25,7 @@ from reenact.rigs import makehuman
 from reenact.rigs.personalise import LocalField, Transfer, affine_map, close_pairs, rigid_rotation
 from reenact.rigs.rig import PARTS, Rig
 
-VERSION = 2
+VERSION = 4
 """Part of the cache key: raise it with any change to what `build` returns."""
 
 Color = tuple[float, float, float]
@@ -172,7 +172,7 @@ CAST: dict[str, Character] = {
         shapes={
             "head/head-round": 1.0,
             "eyes/*-eye-bag-decr": 1.0,
-            "eyebrows/eyebrows-angle-down": 0.5,
+            "eyebrows/eyebrows-angle-up": 1.0,
             "eyes/*-eye-height1-incr": 0.7,
             "eyes/*-eye-height2-incr": 1.0,
             "eyes/*-eye-height3-incr": 0.7,
@@ -204,8 +204,8 @@ CAST: dict[str, Character] = {
             mouth=(0.38, 0.08, 0.12),
         ),
         brow_thickness=2.0,
-        brow_lift=0.0015,
-        brow_tilt=0.005,
+        brow_lift=0.002,
+        brow_tilt=0.008,
         teeth_width=0.76,
         iris_size=1.1,
         motion_seed=55,
@@ -696,7 +696,7 @@ def _lashes(rim, is_upper: bool, neutral, offsets, center, radius, character: Ch
     along = np.linspace(0, 1, count)
     taper = np.clip(np.minimum(along / 0.25, (1 - along) / 0.12), 0, 1)
     length = (0.0040 * (0.6 + 0.6 * along) if is_upper else 0.0010) * taper * character.lash_length
-    thickness = (0.0013 if is_upper else 0.0006) * taper
+    thickness = (0.0025 if is_upper else 0.0006) * taper
     scale = radius / 0.0155
 
     def wedge(edge: np.ndarray, ball: np.ndarray) -> np.ndarray:
