@@ -96,8 +96,15 @@ def _vertex_normals(vertices, faces, normals):
             normals[v, 3] = length
 
 
+@_inlined
+def _ceil(x):
+    """The first whole number from x >= 0 on; `math.ceil` would be a call into the C library."""
+    whole = int(x)
+    return whole + int(whole < x)
+
+
 @_compiled
-def _rasterize(screen, faces, front, face_img, inverse_img):
+def _rasterize(screen, faces, candidates, front, face_img, inverse_img):
     """Which front face lies nearest in each pixel, its inverse depth, and which faces are front faces.
 
     A pixel centre on the edge of two faces goes to exactly one of them: `edge(a, b) == -edge(b, a)` holds to the last
@@ -108,23 +115,31 @@ def _rasterize(screen, faces, front, face_img, inverse_img):
     right, bottom = screen.dtype.type(width - 1), screen.dtype.type(height - 1)
     face_img[:] = BACKGROUND
     inverse_img[:] = zero
+    # First without branches, which would be mispredicted once a face: which faces look this way and have a pixel centre
+    # between their outermost columns and rows? On a face rig these are few.
+    count = 0
     for f in range(faces.shape[0]):
         # Counter-clockwise seen from outside is clockwise once rows point down: swap two corners.
         i, k, j = _corners(faces, f)
         xi, yi, xj, yj, xk, yk = screen[i, 0], screen[i, 1], screen[j, 0], screen[j, 1], screen[k, 0], screen[k, 1]
         area = (xj - xi) * (yk - yi) - (xk - xi) * (yj - yi)
-        zi, zj, zk = screen[i, 2], screen[j, 2], screen[k, 2]
-        is_front = area > zero and zi > zero and zj > zero and zk > zero
+        is_front = (area > zero) & (min(screen[i, 2], screen[j, 2], screen[k, 2]) > zero)
+        last_x, last_y = min(max(xi, xj, xk), right), min(max(yi, yj, yk), bottom)
+        columns = int(last_x) - _ceil(max(min(xi, xj, xk), zero))
+        rows = int(last_y) - _ceil(max(min(yi, yj, yk), zero))
         front[f] = is_front
-        if not is_front:
-            continue
+        candidates[count] = f
+        count += is_front & (last_x >= zero) & (last_y >= zero) & (columns >= 0) & (rows >= 0)
+    for candidate in range(count):
+        f = candidates[candidate]
+        i, k, j = _corners(faces, f)
+        xi, yi, xj, yj, xk, yk = screen[i, 0], screen[i, 1], screen[j, 0], screen[j, 1], screen[k, 0], screen[k, 1]
+        zi, zj, zk = screen[i, 2], screen[j, 2], screen[k, 2]
         first_x, last_x = max(min(xi, xj, xk), zero), min(max(xi, xj, xk), right)
         first_y, last_y = max(min(yi, yj, yk), zero), min(max(yi, yj, yk), bottom)
-        if first_x > last_x or first_y > last_y:
-            continue
-        for row in range(math.ceil(first_y), math.floor(last_y) + 1):
+        for row in range(_ceil(first_y), int(last_y) + 1):
             y = screen.dtype.type(row)
-            for column in range(math.ceil(first_x), math.floor(last_x) + 1):
+            for column in range(_ceil(first_x), int(last_x) + 1):
                 x = screen.dtype.type(column)
                 ei = (xj - x) * (yk - y) - (xk - x) * (yj - y)
                 ej = (xk - x) * (yi - y) - (xi - x) * (yk - y)
@@ -283,8 +298,8 @@ def _silhouettes(screen, faces, edges, front, inverse_img, margin, pair_img, cro
         last_s, last_t = (height - 1, width - 1) if along == 0 else (width - 1, height - 1)
         if s1 < zero or s0 > screen.dtype.type(last_s) or not s1 > s0:
             continue
-        first = math.ceil(max(s0, zero))
-        last = math.ceil(min(s1, screen.dtype.type(last_s + 1)))  # not included: the next edge of the outline takes it
+        first = _ceil(max(s0, zero))
+        last = _ceil(min(s1, screen.dtype.type(last_s + 1)))  # not included: the next edge of the outline takes it
         for step in range(first, last):
             fraction = (screen.dtype.type(step) - s0) / (s1 - s0)
             t = t0 + fraction * (t1 - t0)
@@ -376,12 +391,12 @@ def _encode(blended, color, mask, normals):
 @_compiled
 def forward(
     worker, first, last, world, matrix, faces, edges, colors, uv, uv_faces, texture, light, phong, lens, limits,
-    background, finite, vertices, screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img, blended,
-    color, mask, normals,
+    background, finite, vertices, screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img,
+    blended, color, mask, normals, scratch_faces,
 ):  # fmt: skip
     """Render frames `first` to `last`; `limits` is the near plane and the relative depth margin of silhouettes.
 
-    `worker` numbers the thread: it picks scratch memory in `backward`, and is not needed here.
+    `worker` numbers the thread, and picks its own entry of `scratch_...`.
     """
     for b in range(first, last):
         finite[b] = _to_camera(world[b], matrix, vertices[b])
@@ -389,7 +404,7 @@ def forward(
             continue
         _project(vertices[b], lens, limits[0], screen[b])
         _vertex_normals(vertices[b], faces, vertex_normals[b])
-        _rasterize(screen[b], faces, front[b], face_img[b], inverse_img[b])
+        _rasterize(screen[b], faces, scratch_faces[worker], front[b], face_img[b], inverse_img[b])
         _shade(
             vertices[b], faces, colors, uv, uv_faces, texture, light, phong, lens, background, vertex_normals[b],
             face_img[b], image[b],

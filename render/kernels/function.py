@@ -58,7 +58,7 @@ class Fused(torch.autograd.Function):
             cpu.forward, batch, *_scene_arrays(scene, *inputs), limits, scene.background,
             kept["finite"], kept["vertices"], kept["screen"], kept["vertex_normals"], kept["front"], kept["face_img"],
             kept["inverse_img"], kept["image"], kept["pair_img"], kept["crossing_img"], kept["blended"],
-            color, mask, normals,
+            color, mask, normals, kept["scratch_faces"],
         )  # fmt: skip
         if not kept["finite"].all():
             _report_not_finite(world)
@@ -149,6 +149,7 @@ class Workspace:
             "blended": np.empty((*pixels, channels), number),
             "pair_img": np.empty((batch, 2, height, width), np.int32),
             "crossing_img": np.empty((batch, 2, height, width), number),
+            "scratch_faces": np.empty((workers, len(scene.faces) + 1), np.int32),
             "scratch_blended": np.empty((workers, height, width, channels), number),
             "scratch_image": np.empty((workers, height, width, channels), number),
             "scratch_screen": np.empty((workers, vertices, 2), number),
