@@ -51,7 +51,9 @@ class Studio:
         self.neutral = self.photograph(torch.zeros(1, len(rig.names)))[0]  # (3, R, R)
         survey = self.draw(_SURVEY, np.random.default_rng([seed, 2]))
         self.mean_weights = survey.mean(0)
-        self.motion = motion_weight(self.photograph(survey) - self.neutral)
+        residuals = self.photograph(survey) - self.neutral
+        self.contrast = residuals.square().mean().sqrt()
+        self.motion = motion_weight(residuals)
         self.vertex_distance = VertexDistance(rig, survey)
 
     def draw(self, count: int, random: np.random.Generator) -> Float[Tensor, "N K"]:
@@ -71,12 +73,15 @@ class Studio:
         return F.adaptive_avg_pool2d(picture, self.resolution)
 
     def show(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
-        """What a network sees of pictures: residuals, or the pictures themselves."""
-        return pictures - self.neutral if self.residual else pictures
+        """What a network sees of pictures: residuals of unit size on average, or the pictures themselves.
+
+        Residuals are a few hundredths; unscaled, the first normalisation would drown them in its biases.
+        """
+        return (pictures - self.neutral) / self.contrast if self.residual else pictures
 
     def picture(self, shown: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
         """The pictures in [0, 1] behind what a network drew: the inverse of `show`, clamped."""
-        return (shown + self.neutral if self.residual else shown).clamp(0, 1)
+        return (shown * self.contrast + self.neutral if self.residual else shown).clamp(0, 1)
 
 
 def warp(pictures: Float[Tensor, "N C H W"], grid: Float[Tensor, "H W 2"]) -> Float[Tensor, "N C H W"]:

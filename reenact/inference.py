@@ -84,8 +84,7 @@ class ImageRetargeter:
     @torch.inference_mode()
     def reenact(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
         """Pictures of the source redrawn as the target, in the shared layout, in [0, 1]."""
-        drawn = self._draw(self.source_studio.show(pictures))
-        return drawn + self.target_studio.neutral if self.target_studio.residual else drawn
+        return self.target_studio.picture(self._draw(self.source_studio.show(pictures)))
 
     @torch.inference_mode()
     def read(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N Kt"]:

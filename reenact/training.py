@@ -196,7 +196,7 @@ def _bpnet_losses(
             shown = torch.cat([networks.reenactnet(jittered, key), shown[decoded:]])
             sigma = float(random.uniform(0.1, 0.8))
             shown = gaussian_blur2d(shown, (5, 5), (sigma, sigma))
-            shown = shown + 0.01 * torch.randn(shown.shape, generator=noise)
+            shown = shown + 0.05 * torch.randn(shown.shape, generator=noise)
     predicted = networks.bpnets[key](shown)
     losses = {}
     if bpnet.weight_loss:
