@@ -48,10 +48,16 @@ class LayoutConfig:
 class ReenactNetConfig:
     """Shape of ReenactNet: one shared encoder, one decoder per rig."""
 
-    encoder_channels: int = 24
+    encoder_channels: int = 16
     """Channels after the first convolution; doubled at each of the next three."""
     code: int = 128
     """Size of the bottleneck. Far larger ones let identity leak into the code."""
+    decoder: Literal["basis", "convolutional"] = "basis"
+    """`basis` mixes the principal components of the rig's own pictures; `convolutional` is the published family."""
+    components: int = 256
+    """Principal components of a basis decoder."""
+    decoder_width: int = 512
+    """Width of the two hidden layers that mix them."""
     seed_channels: int = 96
     """Channels of the small picture that the code is unfolded to."""
     decoder_channels: int = 16
@@ -100,15 +106,18 @@ class TrainingConfig:
     """Passes over a fixed set of `fixed_frames` pictures; None counts in `steps`."""
     batch_size: int = 16
     """Pictures of each rig per step."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
     """Peak of the schedule."""
+    loss: Literal["l1", "l1+l2"] = "l1+l2"
+    """Distance of redrawn pictures: the published L1, or L1 plus squares. Residuals are nearly all zeros, and L1 alone
+    takes thousands of steps to leave the zero picture."""
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
     """How the learning rate changes over the steps."""
     optimizer: Literal["adamw", "adam"] = "adamw"
     """AdamW with weight decay, or plain Adam."""
     weight_decay: float = 0.01
     """Decoupled weight decay of AdamW."""
-    elastic: float = 0.05
+    elastic: float = 0.0125
     """Elastic jitter of the encoder's input: standard deviation of a 4 x 4 grid, in halves of the picture's width."""
     motion_weighting: bool = True
     """Weight the reconstruction by where each rig's pictures move."""

@@ -41,6 +41,7 @@ class Studio:
             fixed_frames: Draw only this many expressions, once.
             seed: Of the survey and of the fixed expressions.
         """
+        self.seed = seed
         self.rig, self.resolution, self.residual = rig, config.resolution, config.residual
         self.rendered_at = config.supersample * config.resolution
         self.layout = None if layout is None else resize_grid(layout, self.rendered_at)
@@ -61,6 +62,12 @@ class Studio:
         if self.pool is None:
             return motion.expressions(self.rig.names, count, random)
         return self.pool[random.integers(len(self.pool), size=count)]
+
+    @torch.no_grad()
+    def survey(self, count: int) -> Float[Tensor, "N 3 R R"]:
+        """Pictures of as many training expressions, always the same ones."""
+        weights = self.draw(count, np.random.default_rng([self.seed, 3]))
+        return torch.cat([self.photograph(chunk) for chunk in weights.split(64)])
 
     def photograph(
         self, weights: Float[Tensor, "N K"], buffers: tuple[str, ...] = ("color",)

@@ -4,8 +4,8 @@ Kim, Jung, Yun, Seo, Noh 2021, "Deep Learning-Based Unsupervised Human Facial Re
 doi:10.1111/cgf.14400 (KI21).
 
 Paper   Code                        Shape
-E       ReenactNet.encode           (B, C, R, R) -> (B, A, R / 8, R / 8)
-D_s,t   ReenactNet.decoders[key]    (B, A, R / 8, R / 8) -> (B, C, R, R)
+E       ReenactNet.encode           (B, C, R, R) -> (B, D) or (B, A, R / 8, R / 8)
+D_s,t   ReenactNet.decoders[key]    (B, D) or (B, A, R / 8, R / 8) -> (B, C, R, R)
 BPNet   BPNet                       (B, C, R, R) -> (B, K)
 
 The paper names the family (shared encoder, one decoder per face, from the "deepfake" line) and leaves layers and sizes
@@ -43,24 +43,69 @@ class ReenactNet(nn.Module):
             nn.Flatten(),
             nn.Linear(8 * channels * small * small, config.code),
         )
-        self.unfold = nn.Sequential(
-            nn.Linear(config.code, seed * small * small),
-            nn.Unflatten(1, (seed, small, small)),
-            layer.up(seed, seed),
-        )
-        self.decoders = nn.ModuleDict({key: _decoder(seed, config, layer, residual) for key in keys})
+        if config.decoder == "basis":
+            self.unfold = nn.Identity()
+            self.decoders = nn.ModuleDict({key: BasisDecoder(resolution, config) for key in keys})
+        else:
+            self.unfold = nn.Sequential(
+                nn.Linear(config.code, seed * small * small),
+                nn.Unflatten(1, (seed, small, small)),
+                layer.up(seed, seed),
+            )
+            self.decoders = nn.ModuleDict({key: _decoder(seed, config, layer, residual) for key in keys})
 
-    def encode(self, pictures: Float[Tensor, "B C R R"]) -> Float[Tensor, "B A Rs Rs"]:
-        """The expression, unfolded to a small picture that every decoder understands: E."""
+    def encode(self, pictures: Float[Tensor, "B C R R"]) -> Float[Tensor, "B *shape"]:
+        """The expression as every decoder understands it: E. A code (B, D), or one unfolded to a small picture."""
         return self.unfold(self.trunk(pictures))
 
     def code(self, pictures: Float[Tensor, "B C R R"]) -> Float[Tensor, "B D"]:
-        """The bottleneck between trunk and unfolding, where two rigs' equal expressions should meet."""
+        """The bottleneck, where two rigs' equal expressions should meet."""
         return self.trunk(pictures)
 
     def forward(self, pictures: Float[Tensor, "B C R R"], key: str) -> Float[Tensor, "B C R R"]:
         """The expression of the pictures, drawn on the rig `key`. Source: KI21, ReenactNet(I) = D_t(E(I))."""
         return self.decoders[key](self.encode(pictures))
+
+
+class BasisDecoder(nn.Module):
+    """A decoder that mixes the principal components of its rig's own pictures. Ours.
+
+    Where a convolutional decoder learns to draw from nothing, this one is told what the rig's pictures can look like: a
+    few hundred components hold 99 % of their variance, a small dense network finds the mixture, and a step costs a
+    quarter. Until `fit` it draws the zero picture.
+    """
+
+    def __init__(self, resolution: int, config: ReenactNetConfig):
+        super().__init__()
+        count, width = config.components, config.decoder_width
+        self.resolution = resolution
+        self.mix = nn.Sequential(
+            nn.Linear(config.code, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, count)
+        )
+        self.register_buffer("mean", torch.zeros(3 * resolution * resolution))
+        self.register_buffer("components", torch.zeros(count, 3 * resolution * resolution))
+
+    def forward(self, codes: Float[Tensor, "B D"]) -> Float[Tensor, "B 3 R R"]:
+        """Pictures; each component is scaled by how much it varies, so that mixtures are of unit size."""
+        return torch.addmm(self.mean, self.mix(codes), self.components).unflatten(
+            1, (3, self.resolution, self.resolution)
+        )
+
+    @torch.no_grad()
+    def fit(self, pictures: Float[Tensor, "N 3 R R"]) -> float:
+        """Take the components from pictures of the rig; returns the share of their variance that they hold.
+
+        With fewer pictures than components the rest stay zero.
+        """
+        flat = pictures.flatten(1)
+        self.mean.copy_(flat.mean(0))
+        centred = flat - self.mean
+        values, vectors = torch.linalg.eigh((centred @ centred.T).double())  # of the small side, ascending
+        count = min(len(self.components), len(flat) - 1)
+        values, vectors = values.flip(0).clamp_min(0), vectors.flip(1)
+        # Rows of U^T X are components times singular values; over sqrt(N) they are components times deviations.
+        self.components[:count] = (vectors[:, :count].T.float() @ centred) / len(flat) ** 0.5
+        return float(values[:count].sum() / values.sum().clamp_min(1e-12))
 
 
 class BPNet(nn.Module):

@@ -32,6 +32,8 @@ from reenact.models import Networks
 from reenact.preview import save_preview
 from reenact.run import Run, networks_state
 
+_BASIS_PICTURES = 2000
+"""Pictures of each rig whose principal components a basis decoder mixes."""
 _LOG_EVERY = 20
 """Steps between lines of metrics.jsonl; each holds the mean since the last."""
 
@@ -74,6 +76,10 @@ def train(config: Config, resume: bool = False) -> Path:
         networks = run.networks()
         stages = _stages(config, studios, networks)
         stage_index, first, optimizer = _restore(run, networks, stages) if resume else (0, 0, None)
+        if (stage_index, first) == (0, 0) and config.reenactnet.decoder == "basis":
+            with console.status("Finding the components of each rig's pictures"):
+                for key, studio in studios.items():
+                    networks.reenactnet.decoders[key].fit(studio.show(studio.survey(_BASIS_PICTURES)))
         done = sum(stage.steps for stage in stages[:stage_index])
         with _progress(console) as show:
             for index, stage in list(enumerate(stages))[stage_index:]:
@@ -168,7 +174,9 @@ def _reenactnet_losses(
     losses = {}
     for (key, studio), code in zip(studios.items(), codes):
         weight = studio.motion if config.training.motion_weighting else None
-        losses[f"reconstruction.{key}"] = picture_distance(networks.reenactnet.decoders[key](code), shown[key], weight)
+        drawn = networks.reenactnet.decoders[key](code)
+        squared = config.training.loss == "l1+l2"
+        losses[f"reconstruction.{key}"] = picture_distance(drawn, shown[key], weight, squared)
     return losses
 
 

@@ -82,9 +82,7 @@ class Rig:
     def vertices(self, weights: Float[Tensor, "*batch K"]) -> Float[Tensor, "*batch V 3"]:
         """The expression that the weights make: neutral + sum of weighted deltas. Source: KI21, Eq. 1."""
         if weights.shape[-1] != len(self.names):
-            raise ReenactError(
-                f"{self.name}: expected weights (..., {len(self.names)}), got {tuple(weights.shape)}"
-            )
+            raise ReenactError(f"{self.name}: expected weights (..., {len(self.names)}), got {tuple(weights.shape)}")
         flat = weights @ self.deltas.flatten(1)  # (..., 3 V): one matrix product
         return self.neutral + flat.unflatten(-1, self.neutral.shape)
 
