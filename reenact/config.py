@@ -57,7 +57,7 @@ class ReenactNetConfig:
     components: int = 256
     """Principal components of a basis decoder."""
     decoder_width: int = 512
-    """Width of the two hidden layers that mix them."""
+    """Width of the two shared layers between the code and the mixtures."""
     seed_channels: int = 96
     """Channels of the small picture that the code is unfolded to."""
     decoder_channels: int = 16
@@ -94,6 +94,8 @@ class BPNetConfig:
     """Factor of the root mean square vertex error of the predicted weights, relative to the motion (ours)."""
     decoded_fraction: float = 0.3
     """Share of the pictures that are first passed through ReenactNet, as they will be at inference."""
+    image_fraction: float = 0.25
+    """Share of the pictures whose predicted weights are rendered again for L_r, which costs more than all the rest."""
 
 
 @dataclass(frozen=True)
@@ -117,10 +119,12 @@ class TrainingConfig:
     """AdamW with weight decay, or plain Adam."""
     weight_decay: float = 0.01
     """Decoupled weight decay of AdamW."""
-    elastic: float = 0.0125
+    elastic: float = 0.025
     """Elastic jitter of the encoder's input: standard deviation of a 4 x 4 grid, in halves of the picture's width."""
     motion_weighting: bool = True
     """Weight the reconstruction by where each rig's pictures move."""
+    echo: int = 2
+    """Steps that each rendered batch serves, newly jittered each time (data echoing): rendering takes half a step."""
     fixed_frames: int | None = None
     """Train on this many pictures per rig, drawn once; None renders fresh expressions at every step."""
     seed: int = 0

@@ -44,7 +44,8 @@ class ReenactNet(nn.Module):
             nn.Linear(8 * channels * small * small, config.code),
         )
         if config.decoder == "basis":
-            self.unfold = nn.Identity()
+            width = config.decoder_width
+            self.unfold = nn.Sequential(nn.Linear(config.code, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
             self.decoders = nn.ModuleDict({key: BasisDecoder(resolution, config) for key in keys})
         else:
             self.unfold = nn.Sequential(
@@ -55,7 +56,7 @@ class ReenactNet(nn.Module):
             self.decoders = nn.ModuleDict({key: _decoder(seed, config, layer, residual) for key in keys})
 
     def encode(self, pictures: Float[Tensor, "B C R R"]) -> Float[Tensor, "B *shape"]:
-        """The expression as every decoder understands it: E. A code (B, D), or one unfolded to a small picture."""
+        """The expression as every decoder understands it: E. Features (B, D), or a small picture."""
         return self.unfold(self.trunk(pictures))
 
     def code(self, pictures: Float[Tensor, "B C R R"]) -> Float[Tensor, "B D"]:
@@ -71,25 +72,23 @@ class BasisDecoder(nn.Module):
     """A decoder that mixes the principal components of its rig's own pictures. Ours.
 
     Where a convolutional decoder learns to draw from nothing, this one is told what the rig's pictures can look like: a
-    few hundred components hold 99 % of their variance, a small dense network finds the mixture, and a step costs a
-    quarter. Until `fit` it draws the zero picture.
+    few hundred components hold 99 % of their variance, one dense layer finds the mixture, and a step costs a quarter.
+    All that is nonlinear stays in the part that the rigs share, which keeps their codes together. Until `fit` it draws
+    the zero picture.
     """
 
     def __init__(self, resolution: int, config: ReenactNetConfig):
         super().__init__()
-        count, width = config.components, config.decoder_width
+        count = config.components
         self.resolution = resolution
-        self.mix = nn.Sequential(
-            nn.Linear(config.code, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, count)
-        )
+        self.mix = nn.Linear(config.decoder_width, count)
         self.register_buffer("mean", torch.zeros(3 * resolution * resolution))
         self.register_buffer("components", torch.zeros(count, 3 * resolution * resolution))
 
-    def forward(self, codes: Float[Tensor, "B D"]) -> Float[Tensor, "B 3 R R"]:
+    def forward(self, features: Float[Tensor, "B D"]) -> Float[Tensor, "B 3 R R"]:
         """Pictures; each component is scaled by how much it varies, so that mixtures are of unit size."""
-        return torch.addmm(self.mean, self.mix(codes), self.components).unflatten(
-            1, (3, self.resolution, self.resolution)
-        )
+        flat = torch.addmm(self.mean, self.mix(features), self.components)
+        return flat.unflatten(1, (3, self.resolution, self.resolution))
 
     @torch.no_grad()
     def fit(self, pictures: Float[Tensor, "N 3 R R"]) -> float:

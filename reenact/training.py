@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from kornia.filters import gaussian_blur2d
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
@@ -34,6 +33,8 @@ from reenact.run import Run, networks_state
 
 _BASIS_PICTURES = 2000
 """Pictures of each rig whose principal components a basis decoder mixes."""
+_PICTURE_NOISE = 0.1
+"""Standard deviation of noise on what BPNet learns from, in units of what `Studio.show` makes."""
 _LOG_EVERY = 20
 """Steps between lines of metrics.jsonl; each holds the mean since the last."""
 
@@ -47,8 +48,16 @@ class _Stage:
     network: torch.nn.Module
     steps: int
     learning_rate: float
-    losses: Callable[[np.random.Generator, torch.Generator], dict[str, Tensor]]
-    """Terms whose sum is minimised, on a batch drawn with the given random numbers."""
+    batch: Callable[[np.random.Generator], dict[str, _Batch]]
+    """Expressions of each rig that takes part, drawn with the given random numbers and photographed."""
+    losses: Callable[[dict[str, _Batch], torch.Generator], dict[str, Tensor]]
+    """Terms whose sum is minimised, on a batch that is jittered and blurred with the given random numbers."""
+
+
+@dataclass(frozen=True)
+class _Batch:
+    weights: Tensor  # (B, K)
+    pictures: Tensor  # (B, 3, R, R) in [0, 1]
 
 
 def train(config: Config, resume: bool = False) -> Path:
@@ -84,13 +93,15 @@ def train(config: Config, resume: bool = False) -> Path:
         with _progress(console) as show:
             for index, stage in list(enumerate(stages))[stage_index:]:
                 optimizer = optimizer or _optimizer(config, stage)
-                log = _Log(run.folder / "metrics.jsonl", stage.name, first)
+                log, batch = _Log(run.folder / "metrics.jsonl", stage.name, first), None
                 networks.train()
                 for step in range(first, stage.steps):
                     seed = [config.training.seed, index, step]
                     for group in optimizer.param_groups:
                         group["lr"] = learning_rate(step, stage.steps, stage.learning_rate, config.training.schedule)
-                    losses = stage.losses(np.random.default_rng(seed), _torch_random(seed))
+                    if batch is None or step % config.training.echo == 0:
+                        batch = stage.batch(np.random.default_rng([*seed[:2], step // config.training.echo]))
+                    losses = stage.losses(batch, _torch_random(seed))
                     loss = torch.stack(list(losses.values())).sum()
                     if not torch.isfinite(loss):
                         raise ReenactError(
@@ -127,84 +138,81 @@ def learning_rate(step: int, steps: int, peak: float, schedule: str) -> float:
 
 def _stages(config: Config, studios: dict[str, Studio], networks: Networks) -> list[_Stage]:
     training, bpnet = config.training, config.bpnet
-    steps = _step_count(training.steps, training.epochs, training.fixed_frames, training.batch_size)
     stages = [
         _Stage(
             "reenactnet",
             networks.reenactnet,
-            steps,
+            _step_count(training.steps, training.epochs, training.fixed_frames, training.batch_size),
             training.learning_rate,
-            lambda random, noise: _reenactnet_losses(config, studios, networks, random, noise),
+            lambda random: {key: _draw(studio, training.batch_size, random) for key, studio in studios.items()},
+            lambda batch, noise: _reenactnet_losses(config, studios, networks, batch, noise),
         )
     ]
-    steps = _step_count(bpnet.steps, bpnet.epochs, training.fixed_frames, bpnet.batch_size)
     for key, studio in studios.items():
         stages.append(
             _Stage(
                 f"bpnet.{key}",
                 networks.bpnets[key],
-                steps,
+                _step_count(bpnet.steps, bpnet.epochs, training.fixed_frames, bpnet.batch_size),
                 bpnet.learning_rate,
-                lambda random, noise, key=key, studio=studio: _bpnet_losses(
-                    config, studio, networks, key, random, noise
+                lambda random, key=key, studio=studio: {key: _draw(studio, bpnet.batch_size, random)},
+                lambda batch, noise, key=key, studio=studio: _bpnet_losses(
+                    config, studio, networks, key, batch[key], noise
                 ),
             )
         )
     return stages
 
 
+@torch.no_grad()
+def _draw(studio: Studio, count: int, random: np.random.Generator) -> _Batch:
+    weights = studio.draw(count, random)
+    return _Batch(weights, studio.photograph(weights))
+
+
 def _reenactnet_losses(
     config: Config,
     studios: dict[str, Studio],
     networks: Networks,
-    random: np.random.Generator,
+    batch: dict[str, _Batch],
     noise: torch.Generator,
 ) -> dict[str, Tensor]:
     """Each rig redraws itself through the shared encoder. Source: KI21, L_recon.
 
-    Ours: residuals against the neutral, jitter of the encoder's input only, weighting by motion.
+    Ours: residuals against the neutral, jitter of the encoder's input only, weighting by motion, squares.
     """
-    count = config.training.batch_size
-    with torch.no_grad():
-        shown = {key: studio.show(studio.photograph(studio.draw(count, random))) for key, studio in studios.items()}
-        seen = torch.cat(list(shown.values()))
-        if config.training.elastic:
-            seen = jitter(seen, config.training.elastic, noise)
-    codes = networks.reenactnet.encode(seen).split(count)
+    training = config.training
+    shown = {key: studio.show(batch[key].pictures) for key, studio in studios.items()}
+    seen = torch.cat(list(shown.values()))
+    if training.elastic:
+        seen = jitter(seen, training.elastic, noise)
+    codes = networks.reenactnet.encode(seen).split(training.batch_size)
     losses = {}
     for (key, studio), code in zip(studios.items(), codes):
-        weight = studio.motion if config.training.motion_weighting else None
         drawn = networks.reenactnet.decoders[key](code)
-        squared = config.training.loss == "l1+l2"
-        losses[f"reconstruction.{key}"] = picture_distance(drawn, shown[key], weight, squared)
+        weight = studio.motion if training.motion_weighting else None
+        losses[f"reconstruction.{key}"] = picture_distance(drawn, shown[key], weight, training.loss == "l1+l2")
     return losses
 
 
 def _bpnet_losses(
-    config: Config,
-    studio: Studio,
-    networks: Networks,
-    key: str,
-    random: np.random.Generator,
-    noise: torch.Generator,
+    config: Config, studio: Studio, networks: Networks, key: str, batch: _Batch, noise: torch.Generator
 ) -> dict[str, Tensor]:
     """Weights are read back from pictures of the rig's own expressions. Source: KI21, L_b = L_w + L_r.
 
-    Ours: part of the pictures passes through ReenactNet first and all are slightly blurred and noisy; errors also count
-    by how far they move the vertices.
+    Ours: part of the pictures passes through ReenactNet first; then all are noisy; errors also count by how far they
+    move the vertices; L_r is taken on part of the pictures.
     """
     bpnet = config.bpnet
-    with torch.no_grad():
-        weights = studio.draw(bpnet.batch_size, random)
-        pictures = studio.photograph(weights)
-        shown = studio.show(pictures)
-        decoded = round(bpnet.decoded_fraction * len(shown))
-        if decoded:
-            jittered = jitter(shown[:decoded], config.training.elastic, noise)
-            shown = torch.cat([networks.reenactnet(jittered, key), shown[decoded:]])
-            sigma = float(random.uniform(0.1, 0.8))
-            shown = gaussian_blur2d(shown, (5, 5), (sigma, sigma))
-            shown = shown + 0.05 * torch.randn(shown.shape, generator=noise)
+    order = torch.randperm(len(batch.weights), generator=noise)
+    weights, pictures = batch.weights[order], batch.pictures[order]
+    shown = studio.show(pictures)
+    decoded = round(bpnet.decoded_fraction * len(shown))
+    if decoded:
+        with torch.no_grad():
+            redrawn = networks.reenactnet(jitter(shown[:decoded], config.training.elastic, noise), key)
+        shown = torch.cat([redrawn, shown[decoded:]])
+        shown = shown + _PICTURE_NOISE * torch.randn(shown.shape, generator=noise)
     predicted = networks.bpnets[key](shown)
     losses = {}
     if bpnet.weight_loss:
@@ -212,7 +220,9 @@ def _bpnet_losses(
     if bpnet.vertex_loss:
         losses["vertices"] = bpnet.vertex_loss * studio.vertex_distance(predicted, weights)
     if bpnet.image_loss:
-        losses["image"] = bpnet.image_loss * picture_distance(studio.photograph(predicted), pictures)
+        rendered = max(1, round(bpnet.image_fraction * len(predicted)))
+        again = studio.photograph(predicted[-rendered:])  # the last were not decoded, unless all were
+        losses["image"] = bpnet.image_loss * picture_distance(again, pictures[-rendered:])
     return losses
 
 

@@ -60,7 +60,7 @@ def test_one_picture_gives_the_same_weights_alone_and_in_a_batch():
 
 def test_a_basis_decoder_can_draw_every_mixture_of_the_pictures_it_was_fitted_to():
     torch.manual_seed(0)
-    decoder = BasisDecoder(16, ReenactNetConfig(code=8, components=8))
+    decoder = BasisDecoder(16, ReenactNetConfig(decoder_width=8, components=8))
     truth = torch.randn(40, 5) @ torch.randn(5, 3 * 16 * 16) + 1.0
     assert decoder.fit(truth.unflatten(1, (3, 16, 16))) == pytest.approx(1.0)
     outside = truth[:3] - decoder.mean
@@ -71,5 +71,5 @@ def test_a_basis_decoder_can_draw_every_mixture_of_the_pictures_it_was_fitted_to
 
 
 def test_a_basis_decoder_that_was_not_fitted_draws_nothing():
-    decoder = BasisDecoder(16, ReenactNetConfig(code=8, components=8))
+    decoder = BasisDecoder(16, ReenactNetConfig(decoder_width=8, components=8))
     assert not decoder(torch.randn(2, 8)).any()
