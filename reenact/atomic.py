@@ -13,7 +13,8 @@ def write_atomically(path: Path | str, data: bytes) -> None:
         OSError: As the system says; nothing is left behind.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")  # beside the target: a rename stays on one disk
+    # Beside the target: a rename stays on one disk. Cut short: the longest name that a disk takes may be the target's.
+    temporary = path.with_name(f".{path.name[:50]}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as file:
             file.write(data)

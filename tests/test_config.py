@@ -172,3 +172,9 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(call, tmp_path, mon
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_may_have_the_longest_name_that_a_disk_takes(tmp_path):
+    path = tmp_path / ("x" * 251 + ".csv")
+    write_atomically(path, b"new")
+    assert path.read_bytes() == b"new"

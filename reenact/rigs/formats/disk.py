@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
+from reenact.atomic import write_atomically
 from reenact.errors import ReenactError
 
 LIMIT = 1 << 30
@@ -50,27 +49,12 @@ def read_text(path: Path) -> str:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Puts the file there whole, or leaves what was there: a temporary file in the same folder, then a rename.
+    """Puts the file there whole, or leaves what was there; see `reenact.atomic`.
 
     Raises:
         ReenactError: The folder is missing or cannot be written.
     """
-    temporary = None
     try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.")
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
-        os.replace(temporary, path)
+        write_atomically(path, data)
     except OSError as error:
-        if temporary is not None:
-            Path(temporary).unlink(missing_ok=True)
         raise ReenactError(f"{path}: cannot be written ({error.strerror}); choose a folder that exists") from error
-
-
-def _umask() -> int:
-    mask = os.umask(0o022)
-    os.umask(mask)
-    return mask

@@ -119,7 +119,9 @@ def _report_rest(path: Path, header: list[str], body: list[list[str]], used: set
         elif any(row[index].strip("-+0. ") for row in body):
             turning.append(name)
     if turning:
-        warnings.warn(f"{path}: rotations are not loaded: {', '.join(turning)}", stacklevel=4)
+        warnings.warn(
+            f"{path}: rotations are not loaded: {', '.join(turning)}; the weights of the blendshapes are", stacklevel=4
+        )
     if strange:
         warnings.warn(
             f"{path}: columns that are no ARKit shape are not loaded: {', '.join(strange)[:300]}", stacklevel=4
