@@ -2,6 +2,7 @@
 
 config.toml          every setting, resolved
 rigs/0-man.npz ...   the rigs as they were; the first is the source, whose layout all others share
+clips/0-man.npz ...  training motion of the rigs that were given some
 layouts.safetensors  sampling grid of each other rig
 metrics.jsonl        losses by stage and step
 checkpoints/         networks, optimizer, position; see `reenact.checkpoint`
@@ -10,6 +11,7 @@ previews/            pictures drawn at each save
 
 from __future__ import annotations
 
+import itertools
 import re
 import tempfile
 from dataclasses import dataclass, replace
@@ -24,11 +26,12 @@ from reenact.data import Studio
 from reenact.errors import ReenactError
 from reenact.layout import find_layout
 from reenact.models import Networks
-from reenact.rigs.files import load_clip, load_rig, save_rig
+from reenact.rigs.files import load_clip, load_rig, save_clip, save_rig
 from reenact.rigs.rig import Rig
 
 _LAYOUT_RESOLUTION = 64
 """Pixels at which layouts are found; a studio enlarges them to the resolution of its pictures."""
+_FILE = re.compile(r"(\d+)-(.+)\.npz")
 
 
 @dataclass(frozen=True)
@@ -39,13 +42,15 @@ class Run:
     config: Config
     rigs: dict[str, Rig]
     layouts: dict[str, Tensor]
+    """(R, R, 2) sampling grid of each rig but the first; empty where the settings ask for none."""
 
     @classmethod
     def create(cls, config: Config) -> Run:
-        """A new run folder with the rigs and their layouts in it.
+        """A new run folder with the rigs, their layouts and their training clips in it.
 
         Raises:
-            ReenactError: The folder already exists, a rig cannot be read or photographed.
+            ReenactError: The folder already holds something, or a rig or clip cannot be read or photographed.
+            OSError: The folder cannot be made.
         """
         rigs = [load_rig(name) for name in (config.source, config.target)]
         folder = Path(config.run) if config.run else _new_folder(rigs)
@@ -55,23 +60,25 @@ class Run:
                 "or name another folder with --run"
             )
         keyed = dict(zip(_keys(rigs), rigs))
-        layouts = {}
-        reference, *others = keyed
-        if config.layout.method == "found":
-            for key in others:
-                layouts[key] = find_layout(
-                    keyed[reference], keyed[key], _LAYOUT_RESOLUTION, config.layout, config.training.seed
-                )
+        clip_names = (config.source_clip, config.target_clip)
+        clips = [None if name is None else load_clip(name, rig) for name, rig in zip(clip_names, rigs)]
         config = replace(config, run=str(folder))
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}-", dir=folder.parent) as unfinished:
+        place = folder.resolve()  # an empty folder may be a symbolic link
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as unfinished:
             whole = Path(unfinished) / "run"
-            (whole / "rigs").mkdir(parents=True)
-            for index, (key, rig) in enumerate(keyed.items()):
+            for name in ("rigs", "clips"):
+                (whole / name).mkdir(parents=True)
+            for index, (key, rig, clip) in enumerate(zip(keyed, rigs, clips)):
                 save_rig(rig, whole / "rigs" / f"{index}-{key}.npz")
-            save_tensors(layouts, whole / "layouts.safetensors")
+                if clip is not None:
+                    save_clip(clip, whole / "clips" / f"{index}-{key}.npz")
             save_config(config, whole / "config.toml")
-            whole.replace(folder)  # a run folder appears whole or not at all; an empty one is taken over
+            layouts = _find_layouts(keyed, config)
+            save_tensors(layouts, whole / "layouts.safetensors")
+            if place.exists():
+                place.rmdir()  # empty, as seen above; not every system replaces a folder
+            whole.replace(place)  # a run folder appears whole or not at all
         return cls(folder, config, keyed, layouts)
 
     @classmethod
@@ -80,14 +87,14 @@ class Run:
 
         Raises:
             FileNotFoundError: There is no run.
+            ReenactError: Its settings, rigs or layouts are missing or damaged.
         """
         folder = Path(folder)
         if not (folder / "config.toml").is_file():
             raise FileNotFoundError(f"{folder}: expected a run folder with config.toml; train one with `reenact train`")
-        files = sorted((folder / "rigs").glob("*.npz"), key=lambda path: int(path.name.split("-", 1)[0]))
-        rigs = {path.stem.split("-", 1)[1]: load_rig(str(path)) for path in files}
         config = replace(load_config(folder / "config.toml"), run=str(folder))
-        return cls(folder, config, rigs, load_tensors(folder / "layouts.safetensors"))
+        rigs = _load_rigs(folder / "rigs")
+        return cls(folder, config, rigs, _load_layouts(folder / "layouts.safetensors", config, list(rigs)))
 
     @property
     def keys(self) -> list[str]:
@@ -95,10 +102,15 @@ class Run:
         return list(self.rigs)
 
     def studio(self, key: str) -> Studio:
-        """The studio that photographs one rig for this run's networks."""
+        """The studio that photographs one rig for this run's networks.
+
+        Raises:
+            ReenactError: The rig cannot be photographed, or its training clip is damaged.
+        """
         index, config = self.keys.index(key), self.config
         clip_name = (config.source_clip, config.target_clip)[index] if index < 2 else None
-        clip = None if clip_name is None else load_clip(clip_name, self.rigs[key])
+        kept = self.folder / "clips" / f"{index}-{key}.npz"  # the file that was named may have moved since
+        clip = None if clip_name is None else load_clip(str(kept) if kept.is_file() else clip_name, self.rigs[key])
         return Studio(
             self.rigs[key],
             config.images,
@@ -118,10 +130,35 @@ class Run:
 
         Raises:
             FileNotFoundError: Nothing was saved yet.
+            ReenactError: No checkpoint is whole, or they are of other networks.
         """
         networks = self.networks()
-        networks.load_state_dict(networks_state(load_checkpoint(self.folder).tensors))
+        restore_networks(networks, load_checkpoint(self.folder).tensors, self.folder)
         return networks.eval()
+
+
+def restore_networks(networks: Networks, tensors: dict[str, Tensor], folder: Path) -> None:
+    """Put the networks' part of a checkpoint back into them.
+
+    Args:
+        networks: Filled in place.
+        tensors: Of a checkpoint; those of the networks begin with "networks.".
+        folder: The run, to begin a message with.
+
+    Raises:
+        ReenactError: They are of networks of another shape.
+    """
+    saved, own = networks_state(tensors), networks.state_dict()
+    shapes, own_shapes = ({name: tuple(value.shape) for name, value in each.items()} for each in (saved, own))
+    strange = sorted(name for name in shapes.keys() | own_shapes.keys() if shapes.get(name) != own_shapes.get(name))
+    if strange:
+        first = strange[0]
+        raise ReenactError(
+            f"{folder}: expected networks as config.toml describes them, got others ({len(strange)} tensors differ; "
+            f"{first}: expected {own_shapes.get(first, 'none')}, got {shapes.get(first, 'none')}); the settings or the "
+            "version of Reenact changed since: take the old ones, or train again"
+        )
+    networks.load_state_dict(saved)
 
 
 def networks_state(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -130,13 +167,54 @@ def networks_state(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
+def _find_layouts(rigs: dict[str, Rig], config: Config) -> dict[str, Tensor]:
+    """A layout for each rig but the first; none at all where the settings say so."""
+    if config.layout.method == "none":
+        return {}
+    reference, *others = rigs
+    seed = config.training.seed
+    return {key: find_layout(rigs[reference], rigs[key], _LAYOUT_RESOLUTION, config.layout, seed) for key in others}
+
+
+def _load_rigs(folder: Path) -> dict[str, Rig]:
+    found = {int(match[1]): (match[2], path) for path in folder.glob("*.npz") if (match := _FILE.fullmatch(path.name))}
+    if sorted(found) != list(range(max(2, len(found)))):
+        raise ReenactError(
+            f"{folder}: expected the rigs of a run, 0-NAME.npz, 1-NAME.npz and so on, got {len(found)} files; "
+            "restore the folder or train again"
+        )
+    return {key: load_rig(str(path)) for _, (key, path) in sorted(found.items())}
+
+
+def _load_layouts(path: Path, config: Config, keys: list[str]) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise ReenactError(f"{path}: expected the layouts of the run, got no file; restore the folder or train again")
+    layouts = load_tensors(path)
+    wanted = keys[1:] if config.layout.method == "found" else []
+    if sorted(layouts) != sorted(wanted):
+        raise ReenactError(
+            f"{path}: expected layouts for {', '.join(wanted) or 'no rig'}, got {', '.join(layouts) or 'none'}; "
+            "restore the folder or train again"
+        )
+    for key, grid in layouts.items():
+        square = grid.dim() == 3 and grid.shape[0] == grid.shape[1] > 0 and grid.shape[2] == 2
+        if not square or grid.dtype != torch.float32 or not bool(torch.isfinite(grid).all()):
+            raise ReenactError(
+                f"{path}: {key}: expected (R, R, 2) finite float32, got {tuple(grid.shape)} {grid.dtype}; "
+                "restore the folder or train again"
+            )
+    return layouts
+
+
 def _keys(rigs: list[Rig]) -> list[str]:
-    """A file-safe key per rig; equal names are numbered."""
+    """A key per rig, safe in files and in a ModuleDict; equal names are numbered."""
     keys: list[str] = []
     for rig in rigs:
-        key = re.sub(r"[^A-Za-z0-9_-]+", "-", rig.name).strip("-") or "rig"
-        count = sum(other == key or other.startswith(f"{key}-") for other in keys)
-        keys.append(f"{key}-{count + 1}" if key in keys else key)
+        key = re.sub(r"[^A-Za-z0-9_-]+", "-", rig.name).strip("-")[:60] or "rig"
+        if hasattr(torch.nn.ModuleDict, key) or hasattr(torch.nn.ModuleDict(), key):  # takes no keys such as "train"
+            key = f"{key}-rig"
+        free = (f"{key}-{number}" for number in itertools.count(2))
+        keys.append(next(name for name in free if name not in keys) if key in keys else key)
     return keys
 
 

@@ -1,6 +1,7 @@
 """train(): the one loop, for ReenactNet and for each rig's BPNet.
 
-Kim et al. 2021 (KI21), sections 3.2 and 3.3. Training goes through stages: ReenactNet first, then one BPNet per rig, so
+Kim et al. 2021 (KI21), "Deep Learning-Based Unsupervised Human Facial Retargeting", doi:10.1111/cgf.14400,
+sections 3.2 and 3.3. Training goes through stages: ReenactNet first, then one BPNet per rig, so
 that each BPNet can learn from pictures as ReenactNet draws them. Every random number of a step comes from (seed, stage,
 step): the position in the data is the step, and a resumed run takes the same next step as an unbroken one.
 """
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -22,6 +24,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
+from reenact.atomic import write_atomically
 from reenact.checkpoint import RunLock, flatten_optimizer, load_checkpoint, restore_optimizer, save_checkpoint
 from reenact.config import Config
 from reenact.data import Studio, jitter
@@ -29,7 +32,7 @@ from reenact.errors import ReenactError
 from reenact.losses import picture_distance, weight_distance
 from reenact.models import Networks
 from reenact.preview import save_preview
-from reenact.run import Run, networks_state
+from reenact.run import Run, restore_networks
 
 _BASIS_PICTURES = 2000
 """Pictures of each rig whose principal components a basis decoder mixes."""
@@ -71,10 +74,14 @@ def train(config: Config, resume: bool = False) -> Path:
         The run folder.
 
     Raises:
-        ReenactError: The folder exists and `resume` is False, another process trains in it, a rig cannot work.
+        FileNotFoundError: There is no run to resume.
+        ReenactError: The folder holds something and `resume` is False, another process trains in it, a rig or clip
+            cannot work, the run is damaged or of another version, a loss is not finite.
+        OSError: The folder cannot be written; the last checkpoint is intact.
         KeyboardInterrupt: Ctrl-C; everything up to the last finished step was saved.
+        SystemExit: SIGTERM, likewise saved; status 143.
     """
-    console = Console()
+    console = Console(markup=False, highlight=False, emoji=False)  # a folder may look like markup
     with console.status("Reading rigs, finding the layout"):
         run = Run.open(Path(config.run or "")) if resume else Run.create(config)
     config = run.config
@@ -119,7 +126,10 @@ def train(config: Config, resume: bool = False) -> Path:
                         _save(run, networks, optimizer, index, step + 1, done + step + 1)
                         _preview(run, networks, studios, index, done + step + 1, console)
                     if interrupted():
-                        console.print(f"Stopped and saved. Go on with: reenact train --run {run.folder} --resume")
+                        console.print(
+                            f"Stopped and saved. Go on with: reenact train --run {_quoted(run)} --resume",
+                            soft_wrap=True,
+                        )
                         raise interrupted()
                 done, first, optimizer = done + stage.steps, 0, None
     _say_next(console, run)
@@ -127,7 +137,16 @@ def train(config: Config, resume: bool = False) -> Path:
 
 
 def learning_rate(step: int, steps: int, peak: float, schedule: str) -> float:
-    """The rate at a step: constant, or one cycle (cosine up over the first 15 %, cosine down to nothing)."""
+    """The rate at a step: constant, or one cycle (cosine up over the first 15 %, cosine down to nothing).
+
+    Args:
+        step: From 0 to `steps` - 1.
+        steps: Of the whole stage.
+        peak: The constant rate, or the highest.
+        schedule: "constant" or "one-cycle".
+
+    Source: one cycle after Smith & Topin 2019, "Super-Convergence", arXiv:1708.07120; cosines instead of lines.
+    """
     if schedule == "constant":
         return peak
     warm = 0.15 * steps
@@ -260,7 +279,7 @@ def _restore(run: Run, networks: Networks, stages: list[_Stage]) -> tuple[int, i
         checkpoint = load_checkpoint(run.folder)
     except FileNotFoundError:  # stopped before the first save: nothing to restore
         return 0, 0, None
-    networks.load_state_dict(networks_state(checkpoint.tensors))
+    restore_networks(networks, checkpoint.tensors, run.folder)
     stage, step = checkpoint.state["stage"], checkpoint.state["step"]
     if step >= stages[stage].steps:
         return stage + 1, 0, None
@@ -276,11 +295,11 @@ class _Log:
         self.path, self.stage = path, stage
         self.pending: dict[str, list[float]] = {}
         self.recent: dict[str, float] = {}
-        self.started, self.last = time.perf_counter(), step
+        self.started, self.step, self.last = time.perf_counter(), step, step
         if path.exists():
             lines = [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
             kept = [line for line in lines if line["stage"] != stage or line["step"] <= step]
-            path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+            write_atomically(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
 
     def add(self, step: int, losses: dict[str, Tensor]) -> None:
         for name, value in losses.items():
@@ -316,7 +335,7 @@ def _preview(
         networks.eval()
         save_preview(run.folder / "previews" / f"{total:06d}.png", studios, networks, trained)
     except Exception as error:
-        console.print(f"preview skipped: {error}")
+        console.print(f"preview skipped: {error}", soft_wrap=True)
     finally:
         networks.train()
 
@@ -338,11 +357,11 @@ def _progress(console: Console) -> Iterator[Callable[[str, int, int, dict[str, f
             started[stage] = (time.perf_counter(), step - 1)
         begun, first = started[stage]
         speed = f"{(step - first) / (time.perf_counter() - begun):.1f} steps/s"
-        text = " ".join(f"{name.split('.')[0]} {value:.4f}" for name, value in losses.items())
+        text = " ".join(f"{name.removeprefix('reconstruction.')} {value:.4f}" for name, value in losses.items())
         progress.update(tasks[stage], completed=step, speed=speed, losses=text)
         if not console.is_terminal and (step % 200 == 0 or step == steps):
             left = (steps - step) * (time.perf_counter() - begun) / (step - first)
-            console.print(f"{stage} {step}/{steps}  {speed}  {left:.0f} s left  {text}")
+            console.print(f"{stage} {step}/{steps}  {speed}  {left:.0f} s left  {text}", soft_wrap=True)
 
     if console.is_terminal:
         with progress:
@@ -373,6 +392,11 @@ def _interrupts() -> Iterator[Callable[[], BaseException | None]]:
 
 
 def _say_next(console: Console, run: Run) -> None:
-    console.print(f"Trained: {run.folder}")
-    console.print(f"  reenact infer {run.folder} CLIP --out result.glb")
-    console.print(f"  reenact evaluate {run.folder}")
+    console.print(f"Trained: {run.folder}", soft_wrap=True)
+    console.print(f"  reenact infer {_quoted(run)} CLIP --out result.glb", soft_wrap=True)
+    console.print(f"  reenact evaluate {_quoted(run)}", soft_wrap=True)
+
+
+def _quoted(run: Run) -> str:
+    """The folder as one word of a command."""
+    return shlex.quote(str(run.folder))
