@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from reenact.config import ImageConfig
+from reenact.errors import ReenactError
 from reenact.losses import VertexDistance, motion_weight
 from reenact.portrait import Portrait
 from reenact.rigs import motion
@@ -40,6 +41,9 @@ class Studio:
             clip: Training motion with the rig's names; None samples random valid expressions without end.
             fixed_frames: Draw only this many expressions, once.
             seed: Of the survey and of the fixed expressions.
+
+        Raises:
+            ReenactError: The rig has no eyes above a mouth, or its pictures do not change.
         """
         self.seed = seed
         self.rig, self.resolution, self.residual = rig, config.resolution, config.residual
@@ -54,6 +58,11 @@ class Studio:
         self.mean_weights = survey.mean(0)
         residuals = self.photograph(survey) - self.neutral
         self.contrast = residuals.square().mean().sqrt()
+        if not self.contrast > 0:
+            raise ReenactError(
+                f"{rig.name}: expected expressions that change its picture, got {_SURVEY} equal ones; check that the "
+                "export kept the deltas, and that the training clip moves"
+            )
         self.motion = motion_weight(residuals)
         self.vertex_distance = VertexDistance(rig, survey)
 
@@ -65,14 +74,17 @@ class Studio:
 
     @torch.no_grad()
     def survey(self, count: int) -> Float[Tensor, "N 3 R R"]:
-        """Pictures of as many training expressions, always the same ones."""
+        """Pictures of that many training expressions, always the same ones; no gradient."""
         weights = self.draw(count, np.random.default_rng([self.seed, 3]))
         return torch.cat([self.photograph(chunk) for chunk in weights.split(64)])
 
     def photograph(
         self, weights: Float[Tensor, "N K"], buffers: tuple[str, ...] = ("color",)
     ) -> Float[Tensor, "N C R R"]:
-        """Pictures in [0, 1] in the shared layout, the named buffers stacked along channels. Differentiable."""
+        """Pictures in the shared layout, the named buffers stacked along channels; "color" is in [0, 1].
+
+        Differentiable to the weights.
+        """
         rendered = self.portrait.render(self.rig.vertices(weights), self.rendered_at, buffers)
         picture = torch.cat([rendered[name] for name in buffers], dim=1)
         if self.layout is not None:
@@ -118,7 +130,9 @@ def jitter(pictures: Float[Tensor, "N C R R"], elastic: float, random: torch.Gen
     """Each picture bent by its own smooth random displacement, so that the encoder cannot rely on exact places.
 
     Args:
+        pictures: Left as they are; the bent ones are new.
         elastic: Standard deviation of a 4 x 4 grid of displacements, in halves of the picture's width.
+        random: Advanced.
     """
     count, resolution = len(pictures), pictures.shape[-1]
     coarse = elastic * torch.randn(count, 2, 4, 4, generator=random)

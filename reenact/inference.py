@@ -1,7 +1,7 @@
 """ImageRetargeter: a trained run as a `Retargeter`, clip to clip through pictures.
 
-Kim et al. 2021 (KI21), section 3: render the source, redraw it as the target with ReenactNet, read the weights with
-BPNet.
+Kim et al. 2021, "Deep Learning-Based Unsupervised Human Facial Retargeting", doi:10.1111/cgf.14400,
+section 3: render the source, redraw it as the target with ReenactNet, read the weights with BPNet.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ class ImageRetargeter:
 
         Raises:
             FileNotFoundError: There is no run, or nothing was saved yet.
+            ReenactError: The run is damaged, or of another version.
         """
         run = Run.open(folder)
         networks = run.trained_networks()
@@ -55,13 +56,14 @@ class ImageRetargeter:
         """
         if clip.names != self.source.names:
             raise ReenactError(
-                f"clip: expected the {len(self.source.names)} names of {self.source.name} in their order"
+                f"clip: expected the {len(self.source.names)} names of {self.source.name} in their order, got "
+                f"{', '.join(clip.names[:3])} and so on; `reenact.rigs.files.conform` gives it those"
             )
         weights = [self.read(self.reenact(self.source_pictures(chunk))) for chunk in clip.weights.split(_CHUNK)]
         return Clip(self.target.names, torch.cat(weights), clip.fps)
 
     def step(self, weights: Float[Tensor, "Ks"]) -> Float[Tensor, "Kt"]:
-        """One frame; the same result as in a clip."""
+        """Weights of one frame, in [0, 1]; the same as in a clip."""
         with torch.inference_mode():
             return self.read(self.reenact(self.source_pictures(weights[None])))[0]
 

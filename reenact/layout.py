@@ -18,6 +18,7 @@ from torch import Tensor
 
 from reenact.config import LayoutConfig
 from reenact.data import identity_grid, warp
+from reenact.errors import ReenactError
 from reenact.portrait import Portrait
 from reenact.rigs import motion
 from reenact.rigs.rig import PARTS, Rig
@@ -27,18 +28,26 @@ _SCALES = (0.06, 0.03, 0.015)
 _REGISTERED_PARTS = ("lips", "brows", "eyes")
 
 
-def find_layout(source: Rig, target: Rig, resolution: int, config: LayoutConfig, seed: int = 0) -> Tensor:
+def find_layout(
+    source: Rig, target: Rig, resolution: int, config: LayoutConfig, seed: int = 0
+) -> Float[Tensor, "{resolution} {resolution} 2"]:
     """The sampling grid that warps pictures of the target onto the layout of the source.
 
     A displacement grid, mirror symmetric, is fitted by Adam to the normalised cross-correlation of blurred feature
     maps, coarse to fine, with a penalty on bending.
 
     Args:
+        source: Its pictures stay where they are.
+        target: Its pictures are warped.
         resolution: Pixels along each side of the pictures; a wider picture gives a finer registration.
+        config: Size and stiffness of the displacement grid, and how long it is fitted.
         seed: Of the random expressions that measure motion energy, drawn independently for both rigs.
 
     Returns:
-        (resolution, resolution, 2) positions in the target's picture, (x, y) in [-1, 1], as `data.warp` takes them.
+        Positions in the target's picture, (x, y) in [-1, 1], as `data.warp` takes them.
+
+    Raises:
+        ReenactError: A rig cannot be photographed, or its pictures do not change.
     """
     both = source.parts is not None and target.parts is not None
     fixed, fixed_weight = _features(source, resolution, config.samples, [seed, 0], both)
@@ -74,6 +83,11 @@ def _features(
         pictures = portrait.render(rig.vertices(chunk), resolution, ("color", "normals"))
         for name in energy:
             energy[name] = energy[name] + (pictures[name] - neutral[name]).abs().sum(dim=(0, 1), keepdim=True)
+    if not all(bool(energy[name].any()) for name in energy):
+        raise ReenactError(
+            f"{rig.name}: expected expressions that change its picture, got {samples} equal ones; check that the "
+            "export kept the deltas"
+        )
     maps = [(energy[name] / energy[name].mean()).sqrt() for name in energy] + [neutral["normals"], neutral["mask"]]
     weight = [1.0, 1.0, 0.5, 0.5, 0.5, 0.5]
     if with_parts:

@@ -27,7 +27,7 @@ from reenact.config import BPNetConfig, Config, ReenactNetConfig
 class ReenactNet(nn.Module):
     """One shared encoder, one decoder per rig.
 
-    Pictures are residuals against the neutral in [-1, 1], or colours in [0, 1] where `residual` is False.
+    Pictures are residuals against the neutral, of unit size on average, or colours in [0, 1] where `residual` is False.
     """
 
     def __init__(self, keys: list[str], resolution: int, config: ReenactNetConfig, residual: bool = True):
@@ -60,7 +60,7 @@ class ReenactNet(nn.Module):
         return self.unfold(self.trunk(pictures))
 
     def code(self, pictures: Float[Tensor, "B C R R"]) -> Float[Tensor, "B D"]:
-        """The bottleneck, where two rigs' equal expressions should meet."""
+        """The bottleneck, where equal expressions of two rigs should meet."""
         return self.trunk(pictures)
 
     def forward(self, pictures: Float[Tensor, "B C R R"], key: str) -> Float[Tensor, "B C R R"]:
@@ -92,7 +92,7 @@ class BasisDecoder(nn.Module):
 
     @torch.no_grad()
     def fit(self, pictures: Float[Tensor, "N 3 R R"]) -> float:
-        """Take the components from pictures of the rig; returns the share of their variance that they hold.
+        """The share of variance that the components hold, which are taken from these pictures of the rig.
 
         With fewer pictures than components the rest stay zero.
         """

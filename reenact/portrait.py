@@ -1,8 +1,9 @@
 """Portrait: the camera, light and framing that photograph a rig.
 
-Kim et al. 2021 (KI21) render every rig with 19 numbers: a 3 x 4 camera matrix, the model's position (3) and scale (1),
-and the position of a point light (3). Camera and light are the same for all rigs; position and scale put each rig's eye
-line and mouth line on the same rows of the picture, the only alignment that the published method has.
+Kim et al. 2021, "Deep Learning-Based Unsupervised Human Facial Retargeting", doi:10.1111/cgf.14400
+(KI21), render every rig with 19 numbers: a 3 x 4 camera matrix, the model's position (3) and scale (1), and the
+position of a point light (3). Camera and light are the same for all rigs; position and scale put each rig's eye line
+and mouth line on the same rows of the picture, the only alignment that the published method has.
 """
 
 from __future__ import annotations
@@ -115,17 +116,20 @@ def face_lines(rig: Rig) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
 
     From the part labels where the rig has them; else from what blink and mouth shapes move, where names tell them; else
     from what any shapes move: motion lies in two heights, around the eyes and around the mouth.
+
+    Raises:
+        ReenactError: Fewer than two shapes move anything.
     """
     if len(rig.part("eyes")) and len(rig.part("lips")):
         return _box_middle(rig, rig.part("eyes")), _box_middle(rig, rig.part("lips"))
     motion = rig.deltas.norm(dim=-1)  # (K, V)
-    known = [arkit.canonical(name) for name in rig.names]
+    moving = motion.sum(1) > 1e-12
+    known = [arkit.canonical(name) if moves else None for name, moves in zip(rig.names, moving)]
     lids = [k for k, name in enumerate(known) if name in _LID_SHAPES]
     mouth = [k for k, name in enumerate(known) if name in _MOUTH_SHAPES]
     if lids and mouth:
         return _motion_middle(rig, motion[lids].sum(0)), _motion_middle(rig, motion[mouth].sum(0))
     heights = (motion * rig.neutral[:, 1]).sum(1) / motion.sum(1).clamp_min(1e-12)  # (K,)
-    moving = motion.sum(1) > 1e-12
     if int(moving.sum()) < 2:
         raise ReenactError(
             f"{rig.name}: expected blendshapes that move eyes and mouth, got {int(moving.sum())} that move anything; "

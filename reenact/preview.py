@@ -1,4 +1,4 @@
-"""A picture of how far the training is."""
+"""Contact sheets: a picture of how far the training is."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from reenact.models import Networks
 from reenact.rigs import arkit, motion
 
 _ROWS = 6
+"""Expressions in a preview."""
 _SHOWN_AT = 128
+"""Pixels along each side of a picture in a sheet."""
 
 
 @torch.no_grad()
@@ -43,7 +45,7 @@ def save_preview(path: Path, studios: dict[str, Studio], networks: Networks, tra
 
 
 def shared_weights(weights: Tensor, source_names: tuple[str, ...], target_names: tuple[str, ...]) -> Tensor | None:
-    """Weights copied by ARKit name; None where fewer than half of the target's names are shared."""
+    """Weights (N, K) copied by ARKit name; None where fewer than half of the target's names are shared."""
     known = {arkit.canonical(name): index for index, name in enumerate(source_names)}
     known.pop(None, None)
     pairs = [(known[arkit.canonical(name)], k) for k, name in enumerate(target_names) if arkit.canonical(name) in known]
