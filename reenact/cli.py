@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -16,6 +17,10 @@ from tyro.extras import subcommand_cli_from_dict
 
 from reenact.config import Config, changed_keys, check_config, load_config
 from reenact.errors import ReenactError
+
+# PyTorch's threads wait for work by spinning, and would take the cores from the renderer's threads, which run between
+# its operations. OpenMP reads this once, when PyTorch loads it.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 # The rest of the project is imported inside the commands: PyTorch takes seconds to load, `--help` should not.
 if TYPE_CHECKING:
@@ -106,7 +111,7 @@ def evaluate(
     from reenact.evaluation import evaluate
     from reenact.report import write_report
 
-    console, results = Console(), []
+    console, results = Console(markup=False, emoji=False), []
     for run in runs:
         with console.status(f"{run}") as status:
             results.append(evaluate(run, frames, seed, lambda stage, run=run, s=status: s.update(f"{run}: {stage}")))
@@ -165,7 +170,7 @@ def rigs(
         raise ReenactError(f"--size: expected 16 to 1024 pixels, got {size}")
     from reenact.rigs.anny import BUILT_IN
 
-    console = Console()
+    console = Console(emoji=False)
     for name, description in BUILT_IN.items():
         console.print(f"[bold]{name:<12}[/bold] {description}", highlight=False, soft_wrap=True)
     if out is None:
@@ -185,7 +190,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Anything else that goes wrong is our mistake, and escapes with its traceback.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    console = Console(stderr=True)
+    console = Console(stderr=True, emoji=False)  # a message may hold ":x:"
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: _say(console, "yellow", "warning", str(message))
         try:

@@ -67,7 +67,7 @@ def test_what_is_not_loaded_is_said(tmp_path):
     with pytest.warns(UserWarning, match="not loaded") as caught:
         livelink.load(path)
     assert [str(warning.message).split(": ", 1)[1] for warning in caught] == [
-        "rotations are not loaded: HeadYaw",
+        "rotations are not loaded: HeadYaw; the weights of the blendshapes are",
         "columns that are no ARKit shape are not loaded: Smirk",
     ]
 
