@@ -93,3 +93,21 @@ def make_random_rig(seed: int) -> Rig:
     tensors = [torch.tensor(array, dtype=torch.float32) for array in (neutral, deltas)]
     names = ("jawOpen", "eyeBlink_L", "ünïcode shape")
     return Rig(f"grid {seed}", tensors[0], tensors[1], names, torch.tensor(faces), **fields)
+
+
+@pytest.fixture(scope="session")
+def toy_run(toy_config, tmp_path_factory):
+    """An opened run of the toys whose networks were saved after a glance at their pictures, without training."""
+    from dataclasses import replace
+
+    from reenact.checkpoint import save_checkpoint
+    from reenact.run import Run
+
+    run = Run.create(replace(toy_config, run=str(tmp_path_factory.mktemp("runs") / "toy")))
+    networks = run.networks()
+    for key in run.keys:
+        studio = run.studio(key)
+        networks.reenactnet.decoders[key].fit(studio.show(studio.survey(20)))
+    tensors = {f"networks.{name}": tensor for name, tensor in networks.state_dict().items()}
+    save_checkpoint(run.folder, 1, tensors, {})
+    return run

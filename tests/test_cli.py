@@ -309,3 +309,32 @@ def test_the_console_script_exits_with_the_status():
     )
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "error: --size: expected 16 to 1024 pixels, got 1\n"
+
+
+def test_colons_in_a_message_do_not_become_pictures(toy_rig, tmp_path, capsys):
+    save_rig(toy_rig, tmp_path / "rig.npz")
+    sentence = fails(capsys, "convert", "synthetic:x:", tmp_path / "c.npz", "--rig", tmp_path / "rig.npz")
+    assert sentence.startswith("synthetic:x:: expected synthetic:SEED")
+
+
+def test_public_names_are_there_and_load_nothing_until_they_are_used():
+    code = (
+        "import sys, reenact\n"
+        "assert 'torch' not in sys.modules\n"
+        "assert set(reenact.__all__) <= set(dir(reenact))\n"
+        "assert all(getattr(reenact, name).__name__ == name for name in reenact.__all__)\n"
+        "try: reenact.nothing\n"
+        "except AttributeError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "module 'reenact' has no attribute 'nothing'\n"
+
+
+@pytest.mark.parametrize(("given", "policy"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")])
+def test_idle_threads_sleep_unless_the_user_says_otherwise(given, policy):
+    environment = {key: value for key, value in os.environ.items() if key != "OMP_WAIT_POLICY"} | given
+    code = "import os, sys, reenact.cli; assert 'torch' not in sys.modules; print(os.environ['OMP_WAIT_POLICY'])"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True, env=environment
+    )
+    assert done.stdout.strip() == policy

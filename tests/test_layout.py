@@ -1,14 +1,18 @@
 """The found layout puts one face's features on another's, and nothing but pictures tells it how."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 import torch.nn.functional as F
 
 from reenact.config import LayoutConfig
 from reenact.data import identity_grid, jitter, resize_grid, warp
+from reenact.errors import ReenactError
 from reenact.layout import find_layout
 from reenact.portrait import Portrait
 from reenact.rigs import anny
+from reenact.rigs.rig import PARTS
 
 _PIXELS = 64
 
@@ -66,3 +70,12 @@ def test_jitter_is_seeded_and_vanishes_at_zero():
     bent = [jitter(picture, 0.1, torch.Generator().manual_seed(1)) for _ in range(2)]
     assert torch.equal(*bent)
     assert (bent[0] - picture).abs().mean() > 0.01
+
+
+def test_a_rig_whose_pictures_do_not_change_is_named(toy_rig):
+    parts = torch.zeros(len(toy_rig.neutral), dtype=torch.int64)
+    parts[toy_rig.neutral[:, 1].argmax()] = PARTS.index("eyes")
+    parts[toy_rig.neutral[:, 1].argmin()] = PARTS.index("lips")
+    still = replace(toy_rig, deltas=torch.zeros_like(toy_rig.deltas), parts=parts)
+    with pytest.raises(ReenactError, match="ball: expected expressions that change its picture"):
+        find_layout(toy_rig, still, 32, LayoutConfig(steps=1, samples=4))

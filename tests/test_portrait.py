@@ -64,3 +64,10 @@ def test_a_rig_that_does_not_move_is_named():
     still = replace(still, deltas=torch.zeros_like(still.deltas), names=tuple(f"s{k}" for k in range(len(still.names))))
     with pytest.raises(ReenactError, match="move"):
         Portrait.of(still)
+
+
+def test_lid_and_mouth_shapes_that_move_nothing_are_not_asked(toy_rig):
+    deltas = toy_rig.deltas.clone()
+    deltas[:2] = 0  # both blinks: the lines come from what the others move
+    eyes, mouth = face_lines(replace(toy_rig, deltas=deltas))
+    assert eyes[1] > 0.02 > -0.02 > mouth[1]

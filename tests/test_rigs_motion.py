@@ -122,6 +122,17 @@ def test_one_frame_is_a_clip(kind):
     assert motion.synthesize(arkit.NAMES, 1 / 30, seed=0, kind=kind).weights.shape == (1, 52)
 
 
+@pytest.mark.parametrize("names", [arkit.NAMES, MERGED, OTHER, ("only",)], ids=["arkit", "merged", "other", "one"])
+@pytest.mark.parametrize("kind", motion.KINDS)
+def test_clips_shorter_than_any_event_are_clips(kind, names):
+    for seed in range(20):
+        for frames in (1, 2, 3, 4, 6, 15):
+            clip = motion.synthesize(names, frames / 30, seed=seed, kind=kind)
+            assert clip.weights.shape == (frames, len(names))
+            assert clip.weights.min() >= 0
+            assert clip.weights.max() <= 1
+
+
 def test_mixed_motion_keeps_the_rules():
     weights = motion.synthesize(arkit.NAMES, 60.0, seed=6).weights.numpy()
     assert (column(weights, "mouthClose") <= column(weights, "jawOpen")).all()

@@ -1,7 +1,9 @@
 """Training goes on where it stopped, bit for bit, and learns."""
 
+import io
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,14 +13,13 @@ from pathlib import Path
 
 import pytest
 import torch
+from rich.console import Console
 
 from reenact.checkpoint import load_checkpoint
 from reenact.config import save_config
 from reenact.errors import ReenactError
-from reenact.inference import ImageRetargeter
-from reenact.rigs.clip import Clip
 from reenact.run import Run, networks_state
-from reenact.training import learning_rate, train
+from reenact.training import _interrupts, _Log, _preview, _say_next, _step_count, learning_rate, train
 
 
 def _trained(config, folder, **training):
@@ -92,26 +93,6 @@ def test_the_one_cycle_rises_to_its_peak_and_ends_near_nothing():
     assert learning_rate(50, 100, 2.0, "constant") == 2.0
 
 
-def test_a_frame_alone_gives_the_weights_that_it_has_in_a_clip(finished):
-    retargeter = ImageRetargeter.load(finished)
-    weights = torch.rand(70, len(retargeter.source.names), generator=torch.Generator().manual_seed(0))
-    moved = retargeter(Clip(retargeter.source.names, weights, 30.0))
-    assert moved.names == retargeter.target.names
-    single = torch.stack([retargeter.step(frame) for frame in weights[60:]])
-    torch.testing.assert_close(single, moved.weights[60:], rtol=0, atol=1e-5)  # float32, other batch size
-
-
-def test_a_clip_with_other_names_is_refused(finished):
-    retargeter = ImageRetargeter.load(finished)
-    with pytest.raises(ReenactError, match="names"):
-        retargeter(Clip(("a",), torch.zeros(1, 1), 30.0))
-
-
-def test_reverse_swaps_the_rigs(finished):
-    forward, reverse = ImageRetargeter.load(finished), ImageRetargeter.load(finished, reverse=True)
-    assert (reverse.source.name, reverse.target.name) == (forward.target.name, forward.source.name)
-
-
 def test_the_run_folder_holds_what_is_needed_to_repeat_it(finished):
     run = Run.open(finished)
     assert [rig.name for rig in run.rigs.values()] == ["ball", "egg"]
@@ -119,3 +100,60 @@ def test_the_run_folder_holds_what_is_needed_to_repeat_it(finished):
     assert {line["stage"] for line in _losses(finished)} == {"reenactnet", "bpnet.ball", "bpnet.egg"}
     with pytest.raises(FileNotFoundError, match="run folder"):
         Run.open(finished / "nothing")
+
+
+def test_resuming_networks_of_other_settings_is_refused(toy_config, toy_run, tmp_path):
+    folder = tmp_path / "edited"
+    shutil.copytree(toy_run.folder, folder)
+    edited = replace(toy_config, bpnet=replace(toy_config.bpnet, hidden=16))
+    save_config(edited, folder / "config.toml")
+    with pytest.raises(ReenactError, match=r"edited: expected networks as config.toml describes them, got others"):
+        train(replace(edited, run=str(folder)), resume=True)
+
+
+def test_resuming_where_nothing_is_says_how_to_begin(toy_config, tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected a run folder"):
+        train(replace(toy_config, run=str(tmp_path / "none")), resume=True)
+
+
+def test_a_log_drops_the_lines_of_steps_that_are_taken_again(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    lines = [{"stage": "a", "step": 20}, {"stage": "b", "step": 20}, {"stage": "b", "step": 40}]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"stage": "b", "st')  # torn by a power cut
+    log = _Log(path, "b", 30)
+    log.add(30, {"x": torch.tensor(2.0)})
+    log.add(31, {"x": torch.tensor(4.0)})
+    log.flush()
+    *kept, added = [json.loads(line) for line in path.read_text().splitlines()]
+    assert kept == lines[:2]
+    assert (added["stage"], added["step"], added["x"], added["loss"]) == ("b", 32, 3.0, 3.0)
+
+
+def test_epochs_over_a_fixed_set_become_steps():
+    assert _step_count(7, None, None, 4) == 7
+    assert _step_count(7, None, 10, 4) == 7
+    assert _step_count(7, 2.0, 10, 4) == 5
+    assert _step_count(7, 1.0, 10, 4) == 3
+
+
+def test_a_preview_that_fails_does_not_stop_the_training(toy_run, tmp_path):
+    said = io.StringIO()
+    _preview(toy_run, toy_run.networks(), {}, 0, 1, Console(file=said))  # no studio to photograph
+    assert said.getvalue().startswith("preview skipped: ")
+
+
+def test_the_commands_to_go_on_with_can_be_pasted(toy_run):
+    said = io.StringIO()
+    _say_next(Console(file=said, markup=False), replace(toy_run, folder=Path("my runs/[b]")))
+    assert "  reenact evaluate 'my runs/[b]'\n" in said.getvalue()
+
+
+def test_sigterm_asks_once_and_a_second_interrupt_stops_at_once():
+    with _interrupts() as interrupted:
+        assert interrupted() is None
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert isinstance(interrupted(), SystemExit)
+        assert interrupted().code == 143
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

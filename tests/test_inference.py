@@ -1,0 +1,64 @@
+"""A trained run moves clips, frame by frame as in batches."""
+
+import pytest
+import torch
+
+from reenact.cli import main
+from reenact.errors import ReenactError
+from reenact.inference import ImageRetargeter
+from reenact.rigs.clip import Clip
+from reenact.rigs.files import load_clip
+
+
+def test_a_frame_alone_gives_the_weights_that_it_has_in_a_clip(toy_run):
+    retargeter = ImageRetargeter.load(toy_run.folder)
+    weights = torch.rand(70, len(retargeter.source.names), generator=torch.Generator().manual_seed(0))
+    moved = retargeter(Clip(retargeter.source.names, weights, 30.0))
+    assert moved.names == retargeter.target.names
+    single = torch.stack([retargeter.step(frame) for frame in weights[60:]])
+    torch.testing.assert_close(single, moved.weights[60:], rtol=0, atol=1e-5)  # float32, other batch size
+
+
+def test_a_clip_with_other_names_is_refused(toy_run):
+    retargeter = ImageRetargeter.load(toy_run.folder)
+    with pytest.raises(ReenactError, match="names"):
+        retargeter(Clip(("a",), torch.zeros(1, 1), 30.0))
+
+
+def test_reverse_swaps_the_rigs(toy_run):
+    forward, reverse = ImageRetargeter.load(toy_run.folder), ImageRetargeter.load(toy_run.folder, reverse=True)
+    assert (reverse.source.name, reverse.target.name) == (forward.target.name, forward.source.name)
+
+
+def test_weights_stay_in_range_and_follow_the_source(toy_run):
+    retargeter = ImageRetargeter.load(toy_run.folder)
+    names = retargeter.source.names
+    moved = retargeter(Clip(names, torch.eye(len(names)), 24.0))
+    assert (len(moved), moved.fps) == (len(names), 24.0)
+    assert moved.weights.min() >= 0
+    assert moved.weights.max() <= 1
+    assert moved.weights.std(0).max() > 0
+
+
+def test_masks_are_the_coverage_of_the_pictures(toy_run):
+    retargeter = ImageRetargeter.load(toy_run.folder)
+    weights = torch.zeros(1, len(retargeter.source.names))
+    for mask in (retargeter.source_masks(weights), retargeter.target_masks(weights)):
+        assert mask.shape == (1, 1, 32, 32)
+        assert (float(mask.min()), float(mask.max())) == (0.0, pytest.approx(1.0, abs=1e-6))
+
+
+def test_reading_the_source_directly_skips_the_redrawing(toy_run):
+    retargeter = ImageRetargeter.load(toy_run.folder)
+    pictures = retargeter.source_pictures(torch.eye(len(retargeter.source.names)))
+    direct, through = retargeter.read_direct(pictures), retargeter.read(retargeter.reenact(pictures))
+    assert direct.shape == through.shape
+    assert not torch.equal(direct, through)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".glb"])
+def test_a_clip_of_a_few_frames_goes_all_the_way(suffix, toy_run, tmp_path, capsys):
+    out = tmp_path / f"out{suffix}"
+    assert main(["infer", f"{toy_run.folder}", "synthetic:0:0.2", "--out", f"{out}", "--reverse"]) == 0
+    assert capsys.readouterr() == (f"{out}: 6 frames, 0.2 s, egg -> ball\n", "")
+    assert len(load_clip(f"{out}", toy_run.rigs["ball"])) == 6
