@@ -67,11 +67,11 @@ class Run:
         place.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as unfinished:
             whole = Path(unfinished) / "run"
-            for name in ("rigs", "clips"):
-                (whole / name).mkdir(parents=True)
+            (whole / "rigs").mkdir(parents=True)
             for index, (key, rig, clip) in enumerate(zip(keyed, rigs, clips)):
                 save_rig(rig, whole / "rigs" / f"{index}-{key}.npz")
                 if clip is not None:
+                    (whole / "clips").mkdir(exist_ok=True)
                     save_clip(clip, whole / "clips" / f"{index}-{key}.npz")
             save_config(config, whole / "config.toml")
             layouts = _find_layouts(keyed, config)
