@@ -63,9 +63,11 @@ class Run:
         clip_names = (config.source_clip, config.target_clip)
         clips = [None if name is None else load_clip(name, rig) for name, rig in zip(clip_names, rigs)]
         config = replace(config, run=str(folder))
-        place = folder.resolve()  # an empty folder may be a symbolic link
+        place = folder.resolve()
         place.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as unfinished:
+        # An empty folder is filled, not replaced: it may be a link, a mounted disk, or where the user stands.
+        beside = place if place.exists() else place.parent
+        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=beside) as unfinished:
             whole = Path(unfinished) / "run"
             (whole / "rigs").mkdir(parents=True)
             for index, (key, rig, clip) in enumerate(zip(keyed, rigs, clips)):
@@ -73,12 +75,15 @@ class Run:
                 if clip is not None:
                     (whole / "clips").mkdir(exist_ok=True)
                     save_clip(clip, whole / "clips" / f"{index}-{key}.npz")
-            save_config(config, whole / "config.toml")
             layouts = _find_layouts(keyed, config)
             save_tensors(layouts, whole / "layouts.safetensors")
-            if place.exists():
-                place.rmdir()  # empty, as seen above; not every system replaces a folder
-            whole.replace(place)  # a run folder appears whole or not at all
+            save_config(config, whole / "config.toml")
+            # A run appears whole or not at all: by one rename, or with its config, without which it is none, last.
+            if beside is place:
+                for part in sorted(whole.iterdir(), key=lambda part: part.name == "config.toml"):
+                    part.replace(place / part.name)
+            else:
+                whole.replace(place)
         return cls(folder, config, keyed, layouts)
 
     @classmethod

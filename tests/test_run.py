@@ -126,6 +126,13 @@ def test_an_empty_folder_is_taken_over_even_through_a_link(linked, quick, tmp_pa
     assert folder.is_symlink() == linked
 
 
+def test_the_folder_that_the_user_stands_in_is_taken_over(quick, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = Run.create(replace(quick, run="."))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["config.toml", "layouts.safetensors", "rigs"]
+    assert Run.open(run.folder).keys == ["ball", "egg"]
+
+
 def test_what_cannot_be_trained_leaves_no_folder(quick, tmp_path):
     with pytest.raises(ReenactError, match="no such file"):
         Run.create(replace(quick, source_clip="none.csv", run=str(tmp_path / "run")))
