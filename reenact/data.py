@@ -6,6 +6,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
+from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from reenact.config import ImageConfig
@@ -64,6 +65,7 @@ class Studio:
                 "export kept the deltas, and that the training clip moves"
             )
         self.motion = motion_weight(residuals)
+        self.energy = _energy(residuals)
         self.vertex_distance = VertexDistance(rig, survey)
 
     def draw(self, count: int, random: np.random.Generator) -> Float[Tensor, "N K"]:
@@ -98,9 +100,24 @@ class Studio:
         """
         return (pictures - self.neutral) / self.contrast if self.residual else pictures
 
+    def level(self, shown: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
+        """What the encoder sees of what the networks are shown: each place and channel divided by how much it varies.
+
+        Dark lips on pale skin and red lips on dark skin move alike and look unlike; after this, less so. Ours.
+        """
+        return shown / self.energy if self.residual else shown
+
     def picture(self, shown: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
         """The pictures in [0, 1] behind what a network drew: the inverse of `show`, clamped."""
         return (shown * self.contrast + self.neutral if self.residual else shown).clamp(0, 1)
+
+
+def _energy(residuals: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "3 R R"]:
+    """Smoothed root mean square residual of each pixel and channel, over the channel's mean; at least 0.15."""
+    resolution = residuals.shape[-1]
+    sigma, size = resolution / 32, 2 * (resolution // 16) + 1
+    smooth = gaussian_blur2d(residuals.square().mean(0, keepdim=True), (size, size), (sigma, sigma))[0].sqrt()
+    return (smooth / smooth.mean(dim=(1, 2), keepdim=True).clamp_min(1e-9)).clamp_min(0.15)
 
 
 def warp(pictures: Float[Tensor, "N C H W"], grid: Float[Tensor, "H W 2"]) -> Float[Tensor, "N C H W"]:

@@ -31,7 +31,7 @@ class ImageRetargeter:
         self.config = config
         self.source, self.target = source.rig, target.rig
         self.source_studio, self.target_studio = source, target
-        self._draw = lambda shown: networks.reenactnet(shown, target_key)
+        self._draw = lambda seen: networks.reenactnet(seen, target_key)
         self._read = networks.bpnets[target_key]
 
     @classmethod
@@ -86,7 +86,7 @@ class ImageRetargeter:
     @torch.inference_mode()
     def reenact(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
         """Pictures of the source redrawn as the target, in the shared layout, in [0, 1]."""
-        return self.target_studio.picture(self._draw(self.source_studio.show(pictures)))
+        return self.target_studio.picture(self._draw(self.source_studio.level(self.source_studio.show(pictures))))
 
     @torch.inference_mode()
     def read(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N Kt"]:

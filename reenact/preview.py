@@ -34,7 +34,7 @@ def save_preview(path: Path, studios: dict[str, Studio], networks: Networks, tra
     columns = [source.photograph(weights)]
     for key in target_keys:
         target = studios[key]
-        drawn = networks.reenactnet(source.show(columns[0]), key)
+        drawn = networks.reenactnet(source.level(source.show(columns[0])), key)
         columns.append(target.picture(drawn))
         if key in trained:
             columns.append(target.photograph(networks.bpnets[key](drawn).clamp(0, 1)))

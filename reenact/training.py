@@ -36,7 +36,7 @@ from reenact.run import Run, restore_networks
 
 _BASIS_PICTURES = 2000
 """Pictures of each rig whose principal components a basis decoder mixes."""
-_PICTURE_NOISE = 0.1
+_PICTURE_NOISE = 0.05
 """Standard deviation of noise on what BPNet learns from, in units of what `Studio.show` makes."""
 _LOG_EVERY = 20
 """Steps between lines of metrics.jsonl; each holds the mean since the last."""
@@ -202,7 +202,7 @@ def _reenactnet_losses(
     """
     training = config.training
     shown = {key: studio.show(batch[key].pictures) for key, studio in studios.items()}
-    seen = torch.cat(list(shown.values()))
+    seen = torch.cat([studio.level(shown[key]) for key, studio in studios.items()])
     if training.elastic:
         seen = jitter(seen, training.elastic, noise)
     codes = networks.reenactnet.encode(seen).split(training.batch_size)
@@ -229,7 +229,8 @@ def _bpnet_losses(
     decoded = round(bpnet.decoded_fraction * len(shown))
     if decoded:
         with torch.no_grad():
-            redrawn = networks.reenactnet(jitter(shown[:decoded], config.training.elastic, noise), key)
+            seen = jitter(studio.level(shown[:decoded]), config.training.elastic, noise)
+            redrawn = networks.reenactnet(seen, key)
         shown = torch.cat([redrawn, shown[decoded:]])
         shown = shown + _PICTURE_NOISE * torch.randn(shown.shape, generator=noise)
     predicted = networks.bpnets[key](shown)
