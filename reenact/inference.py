@@ -35,7 +35,7 @@ class ImageRetargeter:
         self._read = networks.bpnets[target_key]
 
     @classmethod
-    def load(cls, folder: Path, reverse: bool = False) -> ImageRetargeter:
+    def load(cls, folder: Path | str, reverse: bool = False) -> ImageRetargeter:
         """The retargeter that a run trained; `reverse` goes from its target to its source.
 
         Raises:

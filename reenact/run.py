@@ -87,7 +87,7 @@ class Run:
         return cls(folder, config, keyed, layouts)
 
     @classmethod
-    def open(cls, folder: Path) -> Run:
+    def open(cls, folder: Path | str) -> Run:
         """The run in a folder.
 
         Raises:

@@ -34,8 +34,8 @@ from reenact.models import Networks
 from reenact.preview import save_preview
 from reenact.run import Run, restore_networks
 
-_BASIS_PICTURES = 2000
-"""Pictures of each rig whose principal components a basis decoder mixes."""
+_PICTURES_PER_COMPONENT = 8
+"""Pictures of each rig, per principal component that a basis decoder takes from them."""
 _PICTURE_NOISE = 0.05
 """Standard deviation of noise on what BPNet learns from, in units of what `Studio.show` makes."""
 _LOG_EVERY = 20
@@ -93,9 +93,10 @@ def train(config: Config, resume: bool = False) -> Path:
         stages = _stages(config, studios, networks)
         stage_index, first, optimizer = _restore(run, networks, stages) if resume else (0, 0, None)
         if (stage_index, first) == (0, 0) and config.reenactnet.decoder == "basis":
+            pictures = _PICTURES_PER_COMPONENT * config.reenactnet.components
             with console.status("Finding the components of each rig's pictures"):
                 for key, studio in studios.items():
-                    networks.reenactnet.decoders[key].fit(studio.show(studio.survey(_BASIS_PICTURES)))
+                    networks.reenactnet.decoders[key].fit(studio.show(studio.survey(pictures)))
         done = sum(stage.steps for stage in stages[:stage_index])
         with _progress(console) as show:
             for index, stage in list(enumerate(stages))[stage_index:]:

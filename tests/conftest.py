@@ -62,7 +62,7 @@ def toy_config(toy_pair, tmp_path_factory) -> Config:
         target=str(folder / "egg.npz"),
         images=ImageConfig(resolution=32),
         layout=LayoutConfig(steps=10, samples=16),
-        reenactnet=ReenactNetConfig(encoder_channels=8, code=16, seed_channels=16, decoder_channels=8),
+        reenactnet=ReenactNetConfig(encoder_channels=8, code=16, components=16, decoder_width=32),
         bpnet=BPNetConfig(channels=8, hidden=32, steps=12, batch_size=4),
         training=TrainingConfig(steps=12, batch_size=4, save_every=5, threads=1),
     )
