@@ -306,22 +306,38 @@ def _number(value: float | None) -> str:
     return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
 
 
+_POSES: tuple[dict[str, float], ...] = (
+    {"mouthSmileLeft": 0.9, "mouthSmileRight": 0.9, "cheekSquintLeft": 0.6, "cheekSquintRight": 0.6, "jawOpen": 0.12},
+    {"browInnerUp": 0.9, "browOuterUpLeft": 0.8, "browOuterUpRight": 0.8, "eyeWideLeft": 0.9, "eyeWideRight": 0.9}
+    | {"jawOpen": 0.6},
+    {"eyeBlinkLeft": 1.0, "eyeBlinkRight": 1.0},
+    {"mouthPucker": 0.9, "browInnerUp": 0.3},
+    {"browDownLeft": 0.9, "browDownRight": 0.9, "noseSneerLeft": 0.7, "noseSneerRight": 0.7, "mouthFrownLeft": 0.4}
+    | {"mouthFrownRight": 0.4, "eyeSquintLeft": 0.4, "eyeSquintRight": 0.4},
+)
+"""Joy, surprise, a blink, a kiss, anger."""
+
+
 def _draw_rigs(names: list[str], size: int, out: Path) -> None:
-    """A row per rig: name, neutral, and the strongest moments of a clip of emotions."""
+    """A row per rig: name, neutral, and a few poses; random expressions where the shapes have no ARKit meaning."""
     import torch
     from PIL import Image, ImageDraw, ImageFont
 
     from reenact.portrait import Portrait
-    from reenact.rigs import motion
+    from reenact.rigs import arkit, motion
     from reenact.rigs.files import load_rig
 
-    count, label = 5, max(16, size // 8)
+    count, label = len(_POSES), max(16, size // 8)
     sheet = Image.new("RGB", (size * (1 + count), (size + label) * len(names)), "white")
     for row, name in enumerate(names):
         rig = load_rig(name)
-        emotions = motion.synthesize(rig.names, 20.0, seed=1, kind="emotion").weights
-        peaks = [stretch[stretch.sum(1).argmax()] for stretch in emotions.chunk(count)]
-        weights = torch.stack([torch.zeros(len(rig.names)), *peaks])
+        meanings = [arkit.meaning(shape) for shape in rig.names]
+        poses = torch.tensor(
+            [[max((pose.get(part, 0.0) for part in parts), default=0.0) for parts in meanings] for pose in _POSES]
+        )
+        if not poses.any():
+            poses = motion.expressions(rig.names, count, seed=4)
+        weights = torch.cat([torch.zeros(1, len(rig.names)), poses])
         pictures = Portrait.of(rig).render(rig.vertices(weights), size)["color"]
         top = row * (size + label)
         ImageDraw.Draw(sheet).text(
