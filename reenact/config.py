@@ -24,6 +24,8 @@ class ImageConfig:
     """Height and width in pixels; a multiple of 16."""
     supersample: int = 2
     """Render this many times larger and average, so that fine triangles do not flicker."""
+    makeup: bool = True
+    """Paint lips, brows, skin and teeth of every rig alike for the networks, where the rig tells its parts."""
     residual: bool = True
     """Show each network the picture minus the rig's own neutral picture, so that identity, texture and light cancel."""
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from reenact.config import ImageConfig
 from reenact.errors import ReenactError
 from reenact.losses import VertexDistance, motion_weight
-from reenact.portrait import Portrait
+from reenact.portrait import Portrait, made_up
 from reenact.rigs import motion
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
@@ -36,7 +36,7 @@ class Studio:
         """
         Args:
             rig: Photographed by `Portrait.of`.
-            config: Resolution of the pictures, and whether networks see differences from the neutral.
+            config: Resolution of the pictures, their paint, and whether networks see differences from the neutral.
             layout: Sampling grid in [-1, 1] (x, y) of any resolution that warps each picture onto the shared layout;
                 None leaves it.
             clip: Training motion with the rig's names; None samples random valid expressions without end.
@@ -50,7 +50,7 @@ class Studio:
         self.rig, self.resolution, self.residual = rig, config.resolution, config.residual
         self.rendered_at = config.supersample * config.resolution
         self.layout = None if layout is None else resize_grid(layout, self.rendered_at)
-        self.portrait = Portrait.of(rig)
+        self.portrait = Portrait.of(made_up(rig) if config.makeup else rig)
         self.pool = None if clip is None else clip.weights
         if fixed_frames is not None:
             self.pool = self.draw(fixed_frames, np.random.default_rng([seed, 1]))

@@ -19,7 +19,7 @@ from torch import Tensor
 from reenact.config import LayoutConfig
 from reenact.data import identity_grid, warp
 from reenact.errors import ReenactError
-from reenact.portrait import Portrait
+from reenact.portrait import Portrait, made_up
 from reenact.rigs import motion
 from reenact.rigs.rig import PARTS, Rig
 
@@ -74,7 +74,7 @@ def _features(
     rig: Rig, resolution: int, samples: int, seed: list[int], with_parts: bool
 ) -> tuple[Float[Tensor, "1 C R R"], Float[Tensor, "C"]]:
     """Feature maps of one rig in its own framing, and the weight of each."""
-    portrait = Portrait.of(rig)
+    portrait = Portrait.of(made_up(rig))
     buffers = ("color", "normals", "mask", "parts") if with_parts else ("color", "normals", "mask")
     neutral = portrait.render(rig.neutral[None], resolution, buffers)
     weights = motion.expressions(rig.names, samples, np.random.default_rng(seed))

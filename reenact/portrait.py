@@ -8,7 +8,7 @@ and mouth line on the same rows of the picture, the only alignment that the publ
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -29,6 +29,17 @@ HALF_HEIGHT = 0.112
 """Half the height of the picture at the plane of the face, in metres: an adult fills it at scale 1."""
 BACKGROUND = (0.36, 0.38, 0.41)
 """sRGB behind the head."""
+
+MAKEUP = {
+    "skin": (0.80, 0.62, 0.52),
+    "lips": (0.60, 0.22, 0.22),
+    "brows": (0.22, 0.14, 0.10),
+    "lashes": (0.10, 0.08, 0.08),
+    "teeth": (0.90, 0.88, 0.82),
+    "tongue": (0.70, 0.35, 0.35),
+    "mouth": (0.25, 0.08, 0.08),
+}
+"""sRGB of the parts that `made_up` paints."""
 
 _LID_SHAPES = ("eyeBlinkLeft", "eyeBlinkRight")
 _MOUTH_SHAPES = ("mouthPucker", "mouthFunnel", "mouthClose", "mouthSmileLeft", "mouthSmileRight")
@@ -109,6 +120,20 @@ class Portrait:
         seen = world @ matrix[:, :3].T + matrix[:, 3]
         on_plane = seen[..., :2] / -seen[..., 2:] * self.camera.focal
         return torch.stack([1 + on_plane[..., 0], 1 - on_plane[..., 1]], dim=-1) * (resolution / 2)
+
+
+def made_up(rig: Rig) -> Rig:
+    A network then cannot tell faces by their colours, and lips darken where they meet skin on every one. A rig whose lips
+    are not marked stays as it is. Ours.
+    A network then cannot tell faces by their colours, and lips darken where they meet skin on every one of them. A rig
+    whose lips are not marked stays as it is. Ours.
+    """
+    if len(rig.part("lips")) == 0:
+        return rig
+    colors = torch.ones_like(rig.neutral) if rig.colors is None else rig.colors.clone()
+    for part, color in MAKEUP.items():
+        colors[rig.part(part)] = torch.tensor(color, dtype=colors.dtype)
+    return replace(rig, colors=colors, texture=None)
 
 
 def face_lines(rig: Rig) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

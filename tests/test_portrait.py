@@ -7,7 +7,7 @@ import torch
 from conftest import make_toy_rig
 
 from reenact.errors import ReenactError
-from reenact.portrait import EYE_HEIGHT, MOUTH_HEIGHT, Portrait, face_lines
+from reenact.portrait import EYE_HEIGHT, MAKEUP, MOUTH_HEIGHT, Portrait, face_lines, made_up
 from reenact.rigs import anny
 
 
@@ -71,3 +71,16 @@ def test_lid_and_mouth_shapes_that_move_nothing_are_not_asked(toy_rig):
     deltas[:2] = 0  # both blinks: the lines come from what the others move
     eyes, mouth = face_lines(replace(toy_rig, deltas=deltas))
     assert eyes[1] > 0.02 > -0.02 > mouth[1]
+
+
+def test_makeup_paints_every_rig_alike_but_for_the_eyes():
+    dark, pale = made_up(anny.build("anny:woman")), made_up(anny.build("anny:man"))
+    for part, color in MAKEUP.items():
+        assert torch.equal(dark.colors[dark.part(part)], torch.tensor(color).expand(len(dark.part(part)), 3))
+    eyes = pale.part("eyes")
+    assert torch.equal(pale.colors[eyes], anny.build("anny:man").colors[eyes])
+    assert not torch.equal(pale.colors[eyes], dark.colors[eyes])
+
+
+def test_a_rig_that_does_not_tell_its_lips_keeps_its_colours(toy_rig):
+    assert made_up(toy_rig) is toy_rig
