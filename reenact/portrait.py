@@ -123,8 +123,8 @@ class Portrait:
 
 
 def made_up(rig: Rig) -> Rig:
-    A network then cannot tell faces by their colours, and lips darken where they meet skin on every one. A rig whose lips
-    are not marked stays as it is. Ours.
+    """The rig painted like every other: skin, lips, brows, teeth and the rest in `MAKEUP`, eyes as they are.
+
     A network then cannot tell faces by their colours, and lips darken where they meet skin on every one of them. A rig
     whose lips are not marked stays as it is. Ours.
     """
