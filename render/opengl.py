@@ -61,7 +61,7 @@ def render_opengl(
     Raises:
         ValueError: pyrender or its GL library is missing, `samples` is not positive, or `render` refuses the arguments.
     """
-    _check(vertices, faces, height, width, colors, texture, uv, uv_faces, None, background, ("color",))
+    _check(vertices, faces, height, width, colors, texture, uv, uv_faces, None, None, background, ("color",))
     if samples < 1:
         raise ValueError(f"samples: expected 1 or more along each side of a pixel, got {samples}")
     topology(faces, vertices.shape[1])

@@ -20,7 +20,7 @@ from render.kernels.function import Fused, Scene, topology
 from render.rasterize import rasterize
 from render.shade import Light, linear_from_srgb, sample_texture, shade, srgb_from_linear, unit, vertex_normals
 
-BUFFERS = ("color", "mask", "normals", "depth", "parts")
+BUFFERS = ("color", "mask", "normals", "depth", "parts", "attributes")
 
 
 def render(
@@ -36,6 +36,7 @@ def render(
     uv: Float[Tensor, "U 2"] | None = None,
     uv_faces: Int[Tensor, "F 3"] | None = None,
     parts: Int[Tensor, "V"] | None = None,
+    attributes: Float[Tensor, "B V A"] | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
     buffers: Sequence[str] = ("color",),
 ) -> dict[str, Tensor]:
@@ -53,6 +54,7 @@ def render(
         uv: Texture coordinates, (0, 0) top left, clamped at the borders.
         uv_faces: Triangles that index `uv`; None where they equal `faces`.
         parts: Any label of each vertex; a pixel takes that of the nearest corner of its triangle.
+        attributes: Any numbers of each vertex of each copy, such as its motion.
         background: sRGB of what no triangle covers.
         buffers: Which of `BUFFERS` to make.
 
@@ -62,15 +64,16 @@ def render(
         `mask` (B, 1, H, W), share of the pixel that is covered;
         `normals` (B, 3, H, W), unit normals in camera space where covered, 0 outside;
         `depth` (B, 1, H, W), metres in front of the camera at the pixel's centre, 0 outside;
-        `parts` (B, 1, H, W) int64, -1 outside.
-        Colour, mask and normals are blended across silhouettes. Gradient reaches vertices, camera matrix, light
-        position, colours and texture from colour, mask, normals and depth; which triangle is seen has none.
+        `parts` (B, 1, H, W) int64, -1 outside;
+        `attributes` (B, A, H, W), interpolated where covered, 0 outside.
+        Colour, mask, normals and attributes are blended across silhouettes. Gradient reaches vertices, camera matrix,
+        light position, colours, texture and attributes from all but parts; which triangle is seen has none.
 
     Raises:
         ValueError: A vertex is not finite, a face names a missing vertex, a buffer is unknown, a size or count
             disagrees.
     """
-    _check(vertices, faces, height, width, colors, texture, uv, uv_faces, parts, background, buffers)
+    _check(vertices, faces, height, width, colors, texture, uv, uv_faces, parts, attributes, background, buffers)
     dtype = vertices.dtype
     face_array, edge_array = topology(faces, vertices.shape[1])
     number = np.float64 if dtype == torch.float64 else np.float32
@@ -93,15 +96,20 @@ def render(
         with_normals="normals" in buffers,
         with_depth="depth" in buffers,
     )
-    color, mask, normals, inverse_depth, part_img = Fused.apply(
+    if "attributes" not in buffers:
+        attributes = vertices.new_zeros(len(vertices), 0, 0)
+    color, mask, extras, inverse_depth, part_img = Fused.apply(
         vertices,
         camera.world_to_camera.to(dtype),
         torch.ones(vertices.shape[1], 3, dtype=dtype) if colors is None else _linear(colors, dtype),
         torch.zeros(0, 0, 3, dtype=dtype) if texture is None else _linear(texture, dtype),
+        attributes.to(dtype),
         camera.to_camera(light.position.to(dtype)),
         scene,
     )
-    made = {"color": color, "mask": mask, "normals": normals, "parts": part_img}
+    normals = 3 if "normals" in buffers else 0
+    made = {"color": color, "mask": mask, "parts": part_img}
+    made |= {"normals": extras[:, :normals], "attributes": extras[:, normals:]}
     if inverse_depth is not None:
         covered = inverse_depth > 0
         made["depth"] = torch.where(covered, 1 / torch.where(covered, inverse_depth, 1.0), 0.0)
@@ -136,9 +144,10 @@ def render_by_stages(
     colors: Float[Tensor, "V 3"],
     texture: Float[Tensor, "Ht Wt 3"] | None = None,
     uv: Float[Tensor, "V 2"] | None = None,
+    attributes: Float[Tensor, "B V A"] | None = None,
     background: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> dict[str, Tensor]:
-    """Colour, mask and normals as `render` makes them, one readable stage after the other, thousands of times slower.
+    """Colour, mask, normals and attributes as `render` makes them, stage after stage, thousands of times slower.
 
     For reading, and for testing the compiled kernels; gradients are those of autograd.
     """
@@ -154,12 +163,23 @@ def render_by_stages(
     covered = (face_img >= 0)[..., None]
     color_img = shade(albedo, normals, points, camera.to_camera(light.position.to(vertices)), light)
     color_img = torch.where(covered, color_img, linear_from_srgb(torch.tensor(list(background)).to(vertices)))
-    everything = torch.cat([color_img, covered.to(vertices), torch.where(covered, normals, 0.0)], -1)  # (B, H, W, 7)
-    color_img, mask, normals = antialias(everything, face_img, vertices_clip, faces).movedim(-1, 1).split([3, 1, 3], 1)
-    return {"color": srgb_from_linear(color_img), "mask": mask.clamp(0, 1), "normals": normals}
+    if attributes is None:
+        attributes = vertices.new_zeros(len(vertices), vertices.shape[1], 0)
+    attribute_img = interpolate(attributes, faces, face_img, bary_img)
+    everything = torch.cat([color_img, covered.to(vertices), torch.where(covered, normals, 0.0), attribute_img], -1)
+    blended = antialias(everything, face_img, vertices_clip, faces).movedim(-1, 1)  # (B, 7 + A, H, W)
+    color_img, mask, normals, attribute_img = blended.split([3, 1, 3, attributes.shape[-1]], 1)
+    return {
+        "color": srgb_from_linear(color_img),
+        "mask": mask.clamp(0, 1),
+        "normals": normals,
+        "attributes": attribute_img,
+    }
 
 
-def _check(vertices, faces, height, width, colors, texture, uv, uv_faces, parts, background, buffers) -> None:
+def _check(
+    vertices, faces, height, width, colors, texture, uv, uv_faces, parts, attributes, background, buffers
+) -> None:
     for name in buffers:
         if name not in BUFFERS:
             raise ValueError(f"buffers: expected names among {', '.join(BUFFERS)}, got {name!r}")
@@ -174,6 +194,17 @@ def _check(vertices, faces, height, width, colors, texture, uv, uv_faces, parts,
             raise ValueError(f"{name}: expected one for each of {vertices.shape[1]} vertices, got {len(values)}")
     if "parts" in buffers and parts is None:
         raise ValueError("buffers: expected the argument `parts` with the buffer 'parts', got None; pass vertex labels")
+    if "attributes" in buffers:
+        if attributes is None:
+            raise ValueError(
+                "buffers: expected the argument `attributes` with the buffer 'attributes', got None; pass numbers of "
+                "each vertex"
+            )
+        if attributes.shape[:2] != vertices.shape[:2]:
+            raise ValueError(
+                f"attributes: expected ({len(vertices)}, {vertices.shape[1]}, A) as vertices, got "
+                f"{tuple(attributes.shape)}"
+            )
     if texture is not None:
         if uv is None:
             raise ValueError("texture: expected texture coordinates with it, got uv=None; pass uv")

@@ -13,16 +13,20 @@ import torch
 from render_scene import GREY, ambient, at_pixels, bumpy_spheres, flat_camera
 
 from render import Camera, Light, render, render_by_stages
+from render.shade import linear_from_srgb, srgb_from_linear
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 from renderer import Head, gradient_accuracy
 
-FLOATS = ("color", "mask", "normals", "depth")
+FLOATS = ("color", "mask", "normals", "depth", "attributes")
 
 
 @pytest.fixture(scope="module")
 def scene() -> dict:
-    return bumpy_spheres()
+    scene = bumpy_spheres()
+    count = scene["vertices"].shape[1]
+    generator = torch.Generator().manual_seed(7)
+    return {**scene, "attributes": torch.randn(2, count, 2, dtype=torch.float64, generator=generator)}
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +69,15 @@ def test_only_requested_buffers_are_made(scene):
 # Laws
 
 
+def test_colours_under_even_light_are_attributes_too(scene):
+    # Blended alike, so that the two differ by the curve of sRGB alone.
+    linear = linear_from_srgb(scene["colors"]).expand(2, -1, -1)
+    made = picture(scene, texture=None, light=ambient(), attributes=linear)
+    inside = made["mask"].expand(-1, 3, -1, -1) == 1
+    shown = srgb_from_linear(made["attributes"].clamp(0, 1))
+    torch.testing.assert_close(shown[inside], made["color"][inside], rtol=0, atol=1e-5)  # the kernel's sRGB: 6e-7
+
+
 def test_face_order_does_not_change_the_picture(scene):
     order = torch.randperm(len(scene["faces"]), generator=torch.Generator().manual_seed(0))
     plain, shuffled = picture(scene), picture(scene, faces=scene["faces"][order])
@@ -99,7 +112,8 @@ def test_the_nearer_of_two_objects_is_seen(scene):
 
 
 def test_frames_of_a_batch_do_not_know_each_other(scene):
-    together, alone = picture(scene), picture(scene, vertices=scene["vertices"][1:])
+    together = picture(scene)
+    alone = picture(scene, vertices=scene["vertices"][1:], attributes=scene["attributes"][1:])
     for name in FLOATS:
         assert torch.equal(together[name][1:], alone[name])
 
@@ -175,6 +189,7 @@ def test_gradients_of_a_buffer_match_finite_differences(scene, buffer):
     values = {
         "vertices": scene["vertices"], "colors": scene["colors"], "texture": scene["texture"],
         "light": scene["light"].position, "matrix": scene["camera"].world_to_camera,
+        "attributes": scene["attributes"],
     }  # fmt: skip
     mix = None
 
@@ -183,7 +198,7 @@ def test_gradients_of_a_buffer_match_finite_differences(scene, buffer):
         made = picture(
             scene, 14, 13, (buffer,), vertices=values["vertices"], colors=values["colors"], texture=values["texture"],
             light=replace(scene["light"], position=values["light"]),
-            camera=Camera(values["matrix"], scene["camera"].focal),
+            camera=Camera(values["matrix"], scene["camera"].focal), attributes=values["attributes"],
         )[buffer]  # fmt: skip
         mix = torch.randn(made.shape, dtype=made.dtype, generator=generator) if mix is None else mix
         return (made * mix).sum()
@@ -217,7 +232,7 @@ def test_the_fused_kernels_make_the_picture_of_the_readable_stages(scene):
     fused = picture(scene)
     staged = render_by_stages(**scene, height=24, width=20, background=GREY)
     torch.testing.assert_close(fused["color"], staged["color"], rtol=0, atol=1e-6)  # the kernel's sRGB: 6e-7
-    for name in ("mask", "normals"):
+    for name in ("mask", "normals", "attributes"):
         torch.testing.assert_close(fused[name], staged[name], rtol=0, atol=1e-12)  # float64
 
 
@@ -226,7 +241,8 @@ def test_the_fused_kernels_have_the_gradient_of_the_readable_stages(scene):
     vertices = scene["vertices"].clone().requires_grad_()
     fused = picture(scene, vertices=vertices)
     staged = render_by_stages(**{**scene, "vertices": vertices}, height=24, width=20, background=GREY)
-    for name, tolerance in {"color": 1e-5, "mask": 1e-10, "normals": 1e-10}.items():  # sRGB slope; float64
+    tolerances = {"color": 1e-5, "mask": 1e-10, "normals": 1e-10, "attributes": 1e-10}  # sRGB slope; float64
+    for name, tolerance in tolerances.items():
         mix = torch.randn(fused[name].shape, dtype=torch.float64, generator=generator)
         found, expected = (
             torch.autograd.grad((made[name] * mix).sum(), vertices, retain_graph=True)[0] for made in (fused, staged)
@@ -250,7 +266,7 @@ def test_float32_and_float64_agree(scene):
 
 def _mask_sum(queue) -> None:
     scene = bumpy_spheres()
-    queue.put(picture(scene)["mask"].sum().item())
+    queue.put(picture(scene, buffers=("mask",))["mask"].sum().item())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no fork on Windows")
@@ -286,6 +302,8 @@ def test_a_vertex_that_is_not_a_number_is_named(scene):
         ({"vertices": torch.zeros(1, 84, 3, dtype=torch.float16)}, "float32 or float64"),
         ({"colors": torch.zeros(3, 3)}, "colors: expected one for each of 84 vertices, got 3"),
         ({"parts": torch.zeros(3, dtype=torch.int64)}, "parts: expected one for each"),
+        ({"buffers": ("attributes",), "attributes": None}, "pass numbers of each vertex"),
+        ({"buffers": ("attributes",), "attributes": torch.zeros(1, 84, 2)}, "attributes: expected \\(2, 84, A\\)"),
         ({"faces": torch.tensor([[0, 1, 84]]), "texture": None}, "check that faces and vertices belong"),
         ({"faces": torch.tensor([[0, 1, -1]]), "texture": None}, "check that faces and vertices belong"),
         ({"uv": None}, "pass uv"),

@@ -216,10 +216,14 @@ def _phong(nx, ny, nz, px, py, pz, light, phong):
 
 
 @_compiled
-def _shade(vertices, faces, colors, uv, uv_faces, texture, light, phong, lens, background, normals, face_img, image):
-    """Linear colour, coverage and, where `image` has room, the camera-space normal of each pixel."""
+def _shade(
+    vertices, faces, colors, uv, uv_faces, texture, attributes, light, phong, lens, background, normals, face_img,
+    image,
+):  # fmt: skip
+    """Linear colour, coverage, where `image` has room the camera-space normal, and the attributes of each pixel."""
     zero, one = vertices.dtype.type(0), vertices.dtype.type(1)
     height, width, channels = image.shape
+    first_attribute = channels - attributes.shape[1]
     focal = one / lens[0]
     for row in range(height):
         y = (lens[2] - vertices.dtype.type(row)) * focal
@@ -259,10 +263,14 @@ def _shade(vertices, faces, colors, uv, uv_faces, texture, light, phong, lens, b
             image[row, column, 1] = factor * green + highlight
             image[row, column, 2] = factor * blue + highlight
             image[row, column, 3] = one
-            if channels > 4:
+            if first_attribute > 4:
                 image[row, column, 4] = nx
                 image[row, column, 5] = ny
                 image[row, column, 6] = nz
+            for a in range(attributes.shape[1]):
+                image[row, column, first_attribute + a] = (
+                    bi * attributes[i, a] + bj * attributes[j, a] + bk * attributes[k, a]
+                )
 
 
 @_compiled
@@ -354,7 +362,7 @@ _SRGB = (
 
 
 @_inlined
-def _encode(blended, color, mask, normals):
+def _encode(blended, color, mask, extras):
     """Channels-first buffers, the colour in sRGB and clamped.
 
     x ** (1 / 2.4) = s ** (5 / 3) with s = x ** (1 / 4), which is nearly a polynomial. Roots and polynomials become
@@ -371,7 +379,7 @@ def _encode(blended, color, mask, normals):
             mask[0, row, column] = min(max(blended[row, column, 3], zero), one)
         for c in range(4, channels):
             for column in range(width):
-                normals[c - 4, row, column] = blended[row, column, c]
+                extras[c - 4, row, column] = blended[row, column, c]
     for c in range(3):
         for row in range(height):
             for column in range(width):
@@ -390,9 +398,9 @@ def _encode(blended, color, mask, normals):
 
 @_compiled
 def forward(
-    worker, first, last, world, matrix, faces, edges, colors, uv, uv_faces, texture, light, phong, lens, limits,
-    background, finite, vertices, screen, vertex_normals, front, face_img, inverse_img, image, pair_img, crossing_img,
-    blended, color, mask, normals, scratch_faces,
+    worker, first, last, world, matrix, faces, edges, colors, uv, uv_faces, texture, attributes, light, phong, lens,
+    limits, background, finite, vertices, screen, vertex_normals, front, face_img, inverse_img, image, pair_img,
+    crossing_img, blended, color, mask, extras, scratch_faces,
 ):  # fmt: skip
     """Render frames `first` to `last`; `limits` is the near plane and the relative depth margin of silhouettes.
 
@@ -406,16 +414,16 @@ def forward(
         _vertex_normals(vertices[b], faces, vertex_normals[b])
         _rasterize(screen[b], faces, scratch_faces[worker], front[b], face_img[b], inverse_img[b])
         _shade(
-            vertices[b], faces, colors, uv, uv_faces, texture, light, phong, lens, background, vertex_normals[b],
-            face_img[b], image[b],
+            vertices[b], faces, colors, uv, uv_faces, texture, attributes[b], light, phong, lens, background,
+            vertex_normals[b], face_img[b], image[b],
         )  # fmt: skip
         _silhouettes(screen[b], faces, edges, front[b], inverse_img[b], limits[1], pair_img[b], crossing_img[b])
         _blend(image[b], pair_img[b], crossing_img[b], blended[b])
-        _encode(blended[b], color[b], mask[b], normals[b])
+        _encode(blended[b], color[b], mask[b], extras[b])
 
 
 @_compiled
-def _encode_backward(blended, color, g_color, g_mask, g_normals, g_blended):
+def _encode_backward(blended, color, g_color, g_mask, g_extras, g_blended):
     number = blended.dtype.type
     zero, one = number(0), number(1)
     height, width, channels = blended.shape
@@ -432,7 +440,7 @@ def _encode_backward(blended, color, g_color, g_mask, g_normals, g_blended):
             inside = g_mask.shape[0] > 0 and x >= zero and x <= one
             g_blended[row, column, 3] = g_mask[0, row, column] if inside else zero
             for c in range(4, channels):
-                g_blended[row, column, c] = g_normals[c - 4, row, column] if g_normals.shape[0] > 0 else zero
+                g_blended[row, column, c] = g_extras[c - 4, row, column] if g_extras.shape[0] > 0 else zero
 
 
 @_compiled
@@ -472,13 +480,14 @@ def _blend_backward(image, edges, screen, pair_img, crossing_img, g_blended, g_i
 
 @_compiled
 def _shade_backward(
-    vertices, faces, colors, uv, uv_faces, texture, light, phong, lens, normals, face_img, g_image, g_inverse,
-    g_vertices, g_colors, g_texture, g_light, g_normals,
+    vertices, faces, colors, uv, uv_faces, texture, attributes, light, phong, lens, normals, face_img, g_image,
+    g_inverse, g_vertices, g_colors, g_texture, g_attributes, g_light, g_normals,
 ):  # fmt: skip
-    """Gradient through colour, normal and depth of each pixel to the three vertices of its face, and to the light."""
+    """Gradient through colour, normal, attributes and depth of each pixel to its face's vertices, and to the light."""
     number = vertices.dtype.type
     zero, one, two = number(0), number(1), number(2)
     height, width, channels = g_image.shape
+    first_attribute = channels - attributes.shape[1]
     focal = one / lens[0]
     textured = texture.shape[0] > 0
     g_albedo = np.zeros(3, vertices.dtype)
@@ -553,6 +562,16 @@ def _shade_backward(
                 g_bj += g_u * uv[uj, 0] + g_v * uv[uj, 1]
                 g_bk += g_u * uv[uk, 0] + g_v * uv[uk, 1]
 
+            for a in range(attributes.shape[1]):
+                g = g_image[row, column, first_attribute + a]
+                g_bi += g * attributes[i, a]
+                g_bj += g * attributes[j, a]
+                g_bk += g * attributes[k, a]
+                if g_attributes.shape[0] > 0:
+                    g_attributes[i, a] += g * bi
+                    g_attributes[j, a] += g * bj
+                    g_attributes[k, a] += g * bk
+
             # Phong: factor = ambient + diffuse n.l, highlight = specular (r.v) ^ shininess, r.v = 2 n.l n.v - l.v.
             g_nx, g_ny, g_nz, g_w = zero, zero, zero, zero
             if g_inverse.shape[0] > 0:
@@ -575,7 +594,7 @@ def _shade_backward(
                 g_light[2] += g_lz
                 # The point moves along its ray only, so the view vector does not turn.
                 g_w -= x * g_lx + y * g_ly - g_lz
-            if channels > 4:
+            if first_attribute > 4:
                 g_nx += g_image[row, column, 4]
                 g_ny += g_image[row, column, 5]
                 g_nz += g_image[row, column, 6]
@@ -674,9 +693,9 @@ def _to_camera_backward(world, matrix, g_vertices, g_world, g_matrix):
 
 @_compiled
 def backward(
-    worker, first, last, world, matrix, faces, edges, colors, uv, uv_faces, texture, light, phong, lens,
+    worker, first, last, world, matrix, faces, edges, colors, uv, uv_faces, texture, attributes, light, phong, lens,
     vertices, screen, vertex_normals, face_img, image, pair_img, crossing_img, blended, color,
-    g_color, g_mask, g_normals, g_inverse, g_world, g_matrix, g_colors, g_texture, g_light,
+    g_color, g_mask, g_extras, g_inverse, g_world, g_matrix, g_colors, g_texture, g_attributes, g_light,
     scratch_blended, scratch_image, scratch_screen, scratch_vertex_normals, scratch_vertices,
 ):  # fmt: skip
     """Gradients of frames `first` to `last`; all but `g_world` start at 0, and `scratch_...` has one entry a thread.
@@ -686,13 +705,14 @@ def backward(
     g_blended, g_image, g_screen = scratch_blended[worker], scratch_image[worker], scratch_screen[worker]
     g_vertex_normals, g_vertices = scratch_vertex_normals[worker], scratch_vertices[worker]
     for b in range(first, last):
-        _encode_backward(blended[b], color[b], g_color[b], g_mask[b], g_normals[b], g_blended)
+        _encode_backward(blended[b], color[b], g_color[b], g_mask[b], g_extras[b], g_blended)
         _blend_backward(image[b], edges, screen[b], pair_img[b], crossing_img[b], g_blended, g_image, g_screen)
         g_vertices[:] = vertices.dtype.type(0)
         g_vertex_normals[:] = vertices.dtype.type(0)
         _shade_backward(
-            vertices[b], faces, colors, uv, uv_faces, texture, light, phong, lens, vertex_normals[b], face_img[b],
-            g_image, g_inverse[b], g_vertices, g_colors[b], g_texture[b], g_light[b], g_vertex_normals,
+            vertices[b], faces, colors, uv, uv_faces, texture, attributes[b], light, phong, lens, vertex_normals[b],
+            face_img[b], g_image, g_inverse[b], g_vertices, g_colors[b], g_texture[b], g_attributes[b], g_light[b],
+            g_vertex_normals,
         )  # fmt: skip
         _vertex_normals_backward(vertices[b], faces, vertex_normals[b], g_vertex_normals, g_vertices)
         _project_backward(vertices[b], lens, screen[b], g_screen, g_vertices)

@@ -37,28 +37,37 @@ class Scene:
 
 
 class Fused(torch.autograd.Function):
-    """World vertices, 3 x 4 camera matrix, linear colours and texture, camera-space light -> pictures.
+    """World vertices, 3 x 4 camera matrix, linear colours and texture, attributes, camera-space light -> pictures.
 
-    Returns colour, mask, and those of normals, inverse depth and parts that the scene asks for; None for the others.
+    Returns colour, mask, extras (normals if the scene asks for them, then attributes), inverse depth and parts; None
+    for the last two if the scene does not ask for them.
     """
 
     @staticmethod
     def forward(
-        ctx, world: Tensor, matrix: Tensor, colors: Tensor, texture: Tensor, light: Tensor, scene: Scene
+        ctx,
+        world: Tensor,
+        matrix: Tensor,
+        colors: Tensor,
+        texture: Tensor,
+        attributes: Tensor,
+        light: Tensor,
+        scene: Scene,
     ) -> tuple[Tensor | None, ...]:
         batch = len(world)
         height, width = scene.height, scene.width
         color, mask = world.new_empty(batch, 3, height, width), world.new_empty(batch, 1, height, width)
-        normals = world.new_empty(batch, 3 if scene.with_normals else 0, height, width)
-        inputs = [tensor.detach().contiguous() for tensor in (world, matrix, colors, texture, light)]
+        extra_channels = (3 if scene.with_normals else 0) + attributes.shape[-1]
+        extras = world.new_empty(batch, extra_channels, height, width)
+        inputs = [tensor.detach().contiguous() for tensor in (world, matrix, colors, texture, attributes, light)]
         limits = np.array([NEAR, DEPTH_MARGIN], scene.lens.dtype)
-        workspace = Workspace.borrow(batch, world.shape[1], scene)
+        workspace = Workspace.borrow(batch, world.shape[1], 4 + extra_channels, scene)
         kept = workspace.arrays
         over_frames(
             cpu.forward, batch, *_scene_arrays(scene, *inputs), limits, scene.background,
             kept["finite"], kept["vertices"], kept["screen"], kept["vertex_normals"], kept["front"], kept["face_img"],
             kept["inverse_img"], kept["image"], kept["pair_img"], kept["crossing_img"], kept["blended"],
-            color, mask, normals, kept["scratch_faces"],
+            color, mask, extras, kept["scratch_faces"],
         )  # fmt: skip
         if not kept["finite"].all():
             _report_not_finite(world)
@@ -75,28 +84,29 @@ class Fused(torch.autograd.Function):
             ctx.scene, ctx.workspace = scene, workspace
             ctx.save_for_backward(*inputs, color)
             ctx.set_materialize_grads(False)
-        return color, mask, normals if scene.with_normals else None, inverse_img, part_img
+        return color, mask, extras, inverse_img, part_img
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *g_pictures: Tensor | None) -> tuple:
         *inputs, color = ctx.saved_tensors
-        world, _, colors, texture, _ = inputs
+        world, _, colors, texture, attributes, _ = inputs
         kept = ctx.workspace.arrays
-        _, wants_matrix, wants_colors, wants_texture, wants_light, _ = ctx.needs_input_grad
+        _, wants_matrix, wants_colors, wants_texture, wants_attributes, wants_light, _ = ctx.needs_input_grad
         batch, zeros = len(world), world.new_zeros
         nothing = zeros(batch, 0, 0, 0)
         g_world = torch.empty_like(world)
         g_matrix = zeros(batch, 3 if wants_matrix else 0, 4)
         g_colors = zeros(batch, *(colors.shape if wants_colors else (0, 3)))
         g_texture = zeros(batch, *(texture.shape if wants_texture else (0, 0, 3)))
+        g_attributes = zeros(batch, *(attributes.shape[1:] if wants_attributes else (0, attributes.shape[-1])))
         g_light = zeros(batch, 3)
         over_frames(
             cpu.backward, batch, *_scene_arrays(ctx.scene, *inputs),
             kept["vertices"], kept["screen"], kept["vertex_normals"], kept["face_img"], kept["image"],
             kept["pair_img"], kept["crossing_img"], kept["blended"], color,
             *(nothing if gradient is None else gradient.contiguous() for gradient in g_pictures[:4]),
-            g_world, g_matrix, g_colors, g_texture, g_light,
+            g_world, g_matrix, g_colors, g_texture, g_attributes, g_light,
             kept["scratch_blended"], kept["scratch_image"], kept["scratch_screen"], kept["scratch_vertex_normals"],
             kept["scratch_vertices"],
         )  # fmt: skip
@@ -106,6 +116,7 @@ class Fused(torch.autograd.Function):
             g_matrix.sum(0) if wants_matrix else None,
             g_colors.sum(0) if wants_colors else None,
             g_texture.sum(0) if wants_texture else None,
+            g_attributes if wants_attributes else None,
             g_light.sum(0) if wants_light else None,
             None,
         )
@@ -126,10 +137,9 @@ class Workspace:
         self.arrays = arrays
 
     @classmethod
-    def borrow(cls, batch: int, vertices: int, scene: Scene) -> Workspace:
+    def borrow(cls, batch: int, vertices: int, channels: int, scene: Scene) -> Workspace:
         """A workspace that nobody else uses; its contents are undefined."""
         number, height, width = scene.lens.dtype, scene.height, scene.width
-        channels = 7 if scene.with_normals else 4
         workers = os.cpu_count() or 1  # the backward pass may run on more threads than the forward pass
         key = (batch, vertices, len(scene.faces), height, width, channels, number.str)
         try:
@@ -166,10 +176,10 @@ class Workspace:
             self._idle.popitem(last=False)
 
 
-def _scene_arrays(scene: Scene, world, matrix, colors, texture, light) -> tuple:
+def _scene_arrays(scene: Scene, world, matrix, colors, texture, attributes, light) -> tuple:
     return (
-        world, matrix, scene.faces, scene.edges, colors, scene.uv, scene.uv_faces, texture, light, scene.phong,
-        scene.lens,
+        world, matrix, scene.faces, scene.edges, colors, scene.uv, scene.uv_faces, texture, attributes, light,
+        scene.phong, scene.lens,
     )  # fmt: skip
 
 
