@@ -22,10 +22,13 @@ class ImageConfig:
 
     resolution: int = 64
     """Height and width in pixels; a multiple of 16."""
-    supersample: int = 2
-    """Render this many times larger and average, so that fine triangles do not flicker."""
+    supersample: int = 1
+    """Render this many times larger and average: smoother colours, at the square of the cost."""
     makeup: bool = True
     """Paint lips, brows, skin and teeth of every rig alike for the networks, where the rig tells its parts."""
+    motion: bool = True
+    """Add a motion pass, how far each visible point is from where it rests, and read from that. Colours are drawn
+    beside it for people to look at; without it, colours are all that networks have."""
     residual: bool = True
     """Show each network the picture minus the rig's own neutral picture, so that identity, texture and light cancel."""
 
@@ -47,55 +50,75 @@ class LayoutConfig:
 
 
 @dataclass(frozen=True)
+class PairsConfig:
+    """Which shapes of two rigs do the same, found by what they look like; see `reenact.pairs`."""
+
+    method: Literal["found", "none"] = "found"
+    """`found` compares the motion passes of single shapes and trains on the pairs that both rigs agree on; `none`
+    leaves the networks to what they share by themselves."""
+    similarity: float = 0.3
+    """Least correlation of the motion passes of two shapes that count as one."""
+    margin: float = 0.05
+    """By how much the next best shape must correlate less."""
+
+
+@dataclass(frozen=True)
 class ReenactNetConfig:
     """Shape of ReenactNet: one shared encoder, one decoder per rig."""
 
-    encoder_channels: int = 16
-    """Channels after the first convolution; doubled at each of the next three."""
-    code: int = 128
+    network: Literal["components", "convolutional"] = "components"
+    """`components` works between the principal components of each rig's pictures; `convolutional` is the published
+    family."""
+    code: int = 256
     """Size of the bottleneck. Far larger ones let identity leak into the code."""
-    decoder: Literal["basis", "convolutional"] = "basis"
-    """`basis` mixes the principal components of the rig's own pictures; `convolutional` is the published family."""
     components: int = 256
-    """Principal components of a basis decoder."""
-    decoder_width: int = 512
-    """Width of the two shared layers between the code and the mixtures."""
+    """Principal components of what is read from a rig's pictures."""
+    color_components: int = 128
+    """Principal components of the colours that are drawn beside the motion pass."""
+    width: int = 512
+    """Hidden layers of a network on components."""
+    encoder_channels: int = 16
+    """Convolutional: channels after the first convolution; doubled at each of the next three."""
     seed_channels: int = 96
-    """Channels of the small picture that the code is unfolded to."""
+    """Convolutional: channels of the small picture that the code is unfolded to."""
     decoder_channels: int = 16
-    """Half the channels of the decoder's last block; doubled at each earlier one."""
+    """Convolutional: half the channels of the decoder's last block; doubled at each earlier one."""
     decoder_blocks: int = 2
-    """Doublings of the decoder, of three, with a block of their own; the third takes two thirds of the time."""
+    """Convolutional: doublings of the decoder, of three, with a block of their own; the third takes two thirds of the
+    time."""
     kernel: int = 3
-    """Width of the encoder's convolutions."""
+    """Convolutional: width of the encoder's kernels."""
     normalize: bool = True
-    """GroupNorm and SiLU; without it plain leaky ReLU, as the published description suggests."""
+    """Convolutional: GroupNorm and SiLU; without it plain leaky ReLU, as the published description suggests."""
 
 
 @dataclass(frozen=True)
 class BPNetConfig:
-    """Shape and training of BPNet, which reads blendshape weights from a picture."""
+    """Shape and training of BPNet, which reads blendshape weights from a picture. Its kind is ReenactNet's."""
 
     channels: int = 24
-    """Channels after the first convolution."""
-    hidden: int = 256
-    """Width of the hidden dense layer."""
+    """Convolutional: channels after the first convolution."""
+    hidden: int = 512
+    """Width of the hidden dense layers."""
     epochs: float | None = None
-    """Passes over a fixed set of `training.fixed_frames` pictures; None counts in `steps`."""
+    """Passes over the `training.frames` pictures, where they are never refreshed; None counts in `steps`."""
     steps: int = 3000
     """Optimizer steps per rig."""
-    batch_size: int = 16
+    batch_size: int = 64
     """Pictures per step."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     """Peak of the schedule."""
     weight_loss: float = 1.0
     """Factor of L_w, the mean absolute error of the weights."""
-    image_loss: float = 1.0
-    """Factor of L_r, the mean absolute difference between the picture and the render of the predicted weights."""
+    image_loss: float = 0.3
+    """Factor of L_r, the distance between the picture and the render of the predicted weights."""
+    image_from: float = 0.8
+    """Share of the steps before L_r joins: far from the right weights its gradient misleads, and it costs a render."""
     vertex_loss: float = 1.0
     """Factor of the root mean square vertex error of the predicted weights, relative to the motion (ours)."""
-    decoded_fraction: float = 0.3
-    """Share of the pictures that are first passed through ReenactNet, as they will be at inference."""
+    decoded_fraction: float = 0.5
+    """Share of the pictures that ReenactNet draws first, as it will at inference: from the other rig's pictures where
+    there are pairs, else from the rig's own."""
     image_fraction: float = 0.25
     """Share of the pictures whose predicted weights are rendered again for L_r, which costs more than all the rest."""
 
@@ -104,34 +127,37 @@ class BPNetConfig:
 class TrainingConfig:
     """Optimization of ReenactNet, and what both networks share."""
 
-    steps: int = 3000
+    steps: int = 4000
     """Optimizer steps of ReenactNet."""
     epochs: float | None = None
-    """Passes over a fixed set of `fixed_frames` pictures; None counts in `steps`."""
-    batch_size: int = 16
+    """Passes over the `frames` pictures, where they are never refreshed; None counts in `steps`."""
+    batch_size: int = 64
     """Pictures of each rig per step."""
-    learning_rate: float = 3e-3
+    learning_rate: float = 2e-3
     """Peak of the schedule."""
     loss: Literal["l1", "l1+l2"] = "l1+l2"
-    """Distance of redrawn pictures: the published L1, or L1 plus squares. Residuals are nearly all zeros, and L1 alone
-    takes thousands of steps to leave the zero picture."""
+    """Convolutional: distance of redrawn pictures, the published L1, or L1 plus squares. Residuals are nearly all
+    zeros, and L1 alone takes thousands of steps to leave the zero picture."""
+    pair_loss: float = 1.0
+    """Factor of the distance between what is drawn of the other rig's paired picture and the pair."""
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
     """How the learning rate changes over the steps."""
     optimizer: Literal["adamw", "adam"] = "adamw"
     """AdamW with weight decay, or plain Adam."""
     weight_decay: float = 0.01
     """Decoupled weight decay of AdamW."""
-    elastic: float = 0.025
-    """Elastic jitter of the encoder's input: standard deviation of a 4 x 4 grid, in halves of the picture's width."""
+    elastic: float = 0.0
+    """Elastic jitter of the encoder's input: standard deviation of a 4 x 4 grid, in halves of the picture's width.
+    Helps where no pairs teach it to overlook how faces differ."""
     motion_weighting: bool = True
-    """Weight the reconstruction by where each rig's pictures move."""
-    echo: int = 2
-    """Steps that each rendered batch serves, newly jittered each time (data echoing): rendering takes half a step."""
-    fixed_frames: int | None = None
-    """Train on this many pictures per rig, drawn once; None renders fresh expressions at every step."""
+    """Convolutional: weight the reconstruction by where each rig's pictures move."""
+    frames: int = 8192
+    """Rendered expressions of each rig that are in memory at a time."""
+    refresh: int = 2000
+    """Steps after which fresh expressions replace them; 0 keeps the first."""
     seed: int = 0
     """Seed of every random number in the run."""
-    save_every: int = 500
+    save_every: int = 1000
     """Steps between checkpoints; each writes a preview picture."""
     keep: int = 3
     """Newest checkpoints that are kept."""
@@ -155,6 +181,7 @@ class Config:
     """Folder to create for the run; None makes a new one below `runs/`."""
     images: ImageConfig = field(default_factory=ImageConfig)
     layout: LayoutConfig = field(default_factory=LayoutConfig)
+    pairs: PairsConfig = field(default_factory=PairsConfig)
     reenactnet: ReenactNetConfig = field(default_factory=ReenactNetConfig)
     bpnet: BPNetConfig = field(default_factory=BPNetConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
@@ -224,11 +251,20 @@ def check_config(config: Config, origin: str = "settings") -> None:
         if allowed is not None and value is not None and not allowed[1](value):
             raise ReenactError(f"{origin}: {key}: expected {allowed[0]}, got {value}")
     for section, epochs in (("training", config.training.epochs), ("bpnet", config.bpnet.epochs)):
-        if epochs is not None and config.training.fixed_frames is None:
+        if epochs is not None and config.training.refresh:
             raise ReenactError(
-                f"{origin}: {section}.epochs: expected training.fixed_frames beside it, got none; "
-                f"epochs are passes over a fixed set, set how many pictures it has"
+                f"{origin}: {section}.epochs: expected training.refresh = 0 beside it, got {config.training.refresh}; "
+                "epochs are passes over pictures that stay the same"
             )
+    if config.pairs.method == "found" and not config.images.motion:
+        raise ReenactError(
+            f'{origin}: pairs.method: expected images.motion beside "found", got none; colours alone pair the wrong '
+            'shapes, set pairs.method to "none"'
+        )
+    if config.images.motion and not config.images.residual:
+        raise ReenactError(
+            f"{origin}: images.motion: expected images.residual beside it, got none; motion is a residual by nature"
+        )
     if config.bpnet.weight_loss == config.bpnet.image_loss == config.bpnet.vertex_loss == 0:
         raise ReenactError(
             f"{origin}: bpnet: expected a loss above 0, got weight_loss, image_loss and vertex_loss of 0"
@@ -247,8 +283,13 @@ _ALLOWED: dict[str, _Rule] = {
     "layout.steps": _ONE_OR_MORE,
     "layout.bending": _NOT_NEGATIVE,
     "layout.samples": _ONE_OR_MORE,
-    "reenactnet.encoder_channels": _EIGHTS,
+    "pairs.similarity": _FRACTION,
+    "pairs.margin": _FRACTION,
     "reenactnet.code": _ONE_OR_MORE,
+    "reenactnet.components": _ONE_OR_MORE,
+    "reenactnet.color_components": _ONE_OR_MORE,
+    "reenactnet.width": _ONE_OR_MORE,
+    "reenactnet.encoder_channels": _EIGHTS,
     "reenactnet.seed_channels": _EIGHTS,
     "reenactnet.decoder_channels": _EIGHTS,
     "reenactnet.kernel": ("an odd number from 3 to 15", lambda value: 3 <= value <= 15 and value % 2 == 1),
@@ -268,7 +309,9 @@ _ALLOWED: dict[str, _Rule] = {
     "training.learning_rate": _POSITIVE,
     "training.weight_decay": _NOT_NEGATIVE,
     "training.elastic": _FRACTION,
-    "training.fixed_frames": _ONE_OR_MORE,
+    "training.pair_loss": _NOT_NEGATIVE,
+    "training.frames": ("a whole number from 8 to 1,000,000", lambda value: 8 <= value <= 1_000_000),
+    "training.refresh": ("a whole number of at least 0", lambda value: value >= 0),
     "training.seed": ("a whole number from 0 to 2^63 - 1", lambda value: 0 <= value < 2**63),
     "training.save_every": _ONE_OR_MORE,
     "training.keep": _ONE_OR_MORE,

@@ -6,12 +6,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
 from reenact.config import ImageConfig
 from reenact.errors import ReenactError
-from reenact.losses import VertexDistance, motion_weight
 from reenact.portrait import Portrait, made_up
 from reenact.rigs import motion
 from reenact.rigs.clip import Clip
@@ -19,10 +17,15 @@ from reenact.rigs.rig import Rig
 
 _SURVEY = 256
 """Random expressions from which a studio learns how the rig typically moves."""
+_CHUNK = 64
+"""Expressions that are photographed at once: bounds memory, not results."""
 
 
 class Studio:
-    """Photographs one rig, in the shared layout, as residuals against its neutral."""
+    """Photographs one rig, in the shared layout, as residuals against its neutral.
+
+    A picture has the channels of `buffers`: colours, sRGB in [0, 1], and behind them the motion pass if there is one.
+    """
 
     def __init__(
         self,
@@ -30,94 +33,85 @@ class Studio:
         config: ImageConfig,
         layout: Float[Tensor, "R R 2"] | None = None,
         clip: Clip | None = None,
-        fixed_frames: int | None = None,
         seed: int = 0,
     ):
         """
         Args:
             rig: Photographed by `Portrait.of`.
-            config: Resolution of the pictures, their paint, and whether networks see differences from the neutral.
+            config: Resolution of the pictures, their paint and passes, and whether networks see differences from the
+                neutral.
             layout: Sampling grid in [-1, 1] (x, y) of any resolution that warps each picture onto the shared layout;
                 None leaves it.
             clip: Training motion with the rig's names; None samples random valid expressions without end.
-            fixed_frames: Draw only this many expressions, once.
-            seed: Of the survey and of the fixed expressions.
+            seed: Of the survey.
 
         Raises:
             ReenactError: The rig has no eyes above a mouth, or its pictures do not change.
         """
         self.seed = seed
         self.rig, self.resolution, self.residual = rig, config.resolution, config.residual
+        self.buffers = ("color", "motion") if config.motion else ("color",)
         self.rendered_at = config.supersample * config.resolution
         self.layout = None if layout is None else resize_grid(layout, self.rendered_at)
         self.portrait = Portrait.of(made_up(rig) if config.makeup else rig)
         self.pool = None if clip is None else clip.weights
-        if fixed_frames is not None:
-            self.pool = self.draw(fixed_frames, np.random.default_rng([seed, 1]))
-        self.neutral = self.photograph(torch.zeros(1, len(rig.names)))[0]  # (3, R, R)
-        survey = self.draw(_SURVEY, np.random.default_rng([seed, 2]))
-        self.mean_weights = survey.mean(0)
-        residuals = self.photograph(survey) - self.neutral
-        self.contrast = residuals.square().mean().sqrt()
-        if not self.contrast > 0:
+        self.neutral = self.photograph(torch.zeros(1, len(rig.names)))[0]  # (C, R, R)
+        self.typical = self.draw(_SURVEY, np.random.default_rng([seed, 2]))
+        """Weights (N, K) of expressions that show how the rig moves."""
+        residuals = (self.photograph(self.typical) - self.neutral).unflatten(1, (len(self.buffers), 3))
+        contrast = residuals.square().mean((0, 2, 3, 4)).sqrt()  # of each buffer
+        if not bool((contrast > 0).all()):
             raise ReenactError(
                 f"{rig.name}: expected expressions that change its picture, got {_SURVEY} equal ones; check that the "
                 "export kept the deltas, and that the training clip moves"
             )
-        self.motion = motion_weight(residuals)
-        self.energy = _energy(residuals)
-        self.vertex_distance = VertexDistance(rig, survey)
+        self.contrast = contrast.repeat_interleave(3)[:, None, None]  # (C, 1, 1)
 
     def draw(self, count: int, random: np.random.Generator) -> Float[Tensor, "N K"]:
-        """Weights of training expressions: from the clip or the fixed set if there is one, else fresh."""
+        """Weights of training expressions: from the clip if there is one, else fresh."""
         if self.pool is None:
             return motion.expressions(self.rig.names, count, random)
         return self.pool[random.integers(len(self.pool), size=count)]
 
     @torch.no_grad()
-    def survey(self, count: int) -> Float[Tensor, "N 3 R R"]:
+    def survey(self, count: int) -> Float[Tensor, "N C R R"]:
         """Pictures of that many training expressions, always the same ones; no gradient."""
         weights = self.draw(count, np.random.default_rng([self.seed, 3]))
-        return torch.cat([self.photograph(chunk) for chunk in weights.split(64)])
+        return torch.cat([self.photograph(chunk) for chunk in weights.split(_CHUNK)])
 
     def photograph(
-        self, weights: Float[Tensor, "N K"], buffers: tuple[str, ...] = ("color",)
+        self, weights: Float[Tensor, "N K"], buffers: tuple[str, ...] | None = None
     ) -> Float[Tensor, "N C R R"]:
-        """Pictures in the shared layout, the named buffers stacked along channels; "color" is in [0, 1].
+        """Pictures in the shared layout: the studio's buffers, or those named, stacked along channels.
 
-        Differentiable to the weights.
+        Differentiable to the weights. Motion is in metres.
         """
+        buffers = buffers or self.buffers
         rendered = self.portrait.render(self.rig.vertices(weights), self.rendered_at, buffers)
         picture = torch.cat([rendered[name] for name in buffers], dim=1)
         if self.layout is not None:
             picture = warp(picture, self.layout)
         return F.adaptive_avg_pool2d(picture, self.resolution)
 
-    def show(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
+    def glance(self, weights: Float[Tensor, "N K"]) -> Float[Tensor, "N 3 R R"]:
+        """What networks are shown of the buffer that they read from, without the cost of the others."""
+        return self.show(self.photograph(weights, self.buffers[-1:]))
+
+    def show(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N C R R"]:
         """What a network sees of pictures: residuals of unit size on average, or the pictures themselves.
 
-        Residuals are a few hundredths; unscaled, the first normalisation would drown them in its biases.
+        Residuals are a few hundredths; unscaled, the first normalisation would drown them in its biases. Pictures may
+        lack their first buffers.
         """
-        return (pictures - self.neutral) / self.contrast if self.residual else pictures
+        if not self.residual:
+            return pictures
+        channels = pictures.shape[1]
+        return (pictures - self.neutral[-channels:]) / self.contrast[-channels:]
 
-    def level(self, shown: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
-        """What the encoder sees of what the networks are shown: each place and channel divided by how much it varies.
-
-        Dark lips on pale skin and red lips on dark skin move alike and look unlike; after this, less so. Ours.
-        """
-        return shown / self.energy if self.residual else shown
-
-    def picture(self, shown: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
-        """The pictures in [0, 1] behind what a network drew: the inverse of `show`, clamped."""
-        return (shown * self.contrast + self.neutral if self.residual else shown).clamp(0, 1)
-
-
-def _energy(residuals: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "3 R R"]:
-    """Smoothed root mean square residual of each pixel and channel, over the channel's mean; at least 0.15."""
-    resolution = residuals.shape[-1]
-    sigma, size = resolution / 32, 2 * (resolution // 16) + 1
-    smooth = gaussian_blur2d(residuals.square().mean(0, keepdim=True), (size, size), (sigma, sigma))[0].sqrt()
-    return (smooth / smooth.mean(dim=(1, 2), keepdim=True).clamp_min(1e-9)).clamp_min(0.15)
+    def picture(self, shown: Float[Tensor, "N C R R"]) -> Float[Tensor, "N C R R"]:
+        """The pictures behind what a network drew: the inverse of `show`, with colours clamped to [0, 1]."""
+        pictures = shown * self.contrast + self.neutral if self.residual else shown
+        return torch.cat([pictures[:, :3].clamp(0, 1), pictures[:, 3:]], dim=1)
 
 
 def warp(pictures: Float[Tensor, "N C H W"], grid: Float[Tensor, "H W 2"]) -> Float[Tensor, "N C H W"]:

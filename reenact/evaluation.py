@@ -47,7 +47,10 @@ _CHUNK = 64  # frames at a time: bounds memory, not results
 
 @runtime_checkable
 class PictureRetargeter(Protocol):
-    """What evaluation asks of a retargeter that works through pictures; `reenact.inference.ImageRetargeter` is one."""
+    """What evaluation asks of a retargeter that works through pictures; `reenact.inference.ImageRetargeter` is one.
+
+    Pictures begin with three channels of colour in [0, 1], which are compared; what follows is for the networks.
+    """
 
     source: Rig
     target: Rig
@@ -549,7 +552,7 @@ def evaluate_retargeters(
             }
             for name, answer in answers.items()
         }
-        drawn = _in_chunks(forward.reenact, pictures).clamp(0, 1)
+        drawn = _in_chunks(forward.reenact, pictures)
         seen = _PictureComparison(forward.target_pictures, forward.target_masks, truth)
         seen.against({"reenact": answers["reenact"], "neutral": answers["neutral"]}).against_pictures("decoded", drawn)
         decoded = _picture_numbers(seen, "decoded", slice(None))
@@ -640,7 +643,9 @@ class _PictureComparison:
     def _compare(self, name: str, chunks: Any) -> None:
         rows: dict[str, list[Tensor]] = {"mae": [], "ssim": [], "mae_masked": [], "mse": []}
         total = torch.zeros(self.pictures.shape[-2:], dtype=torch.float64)
-        for shown, truth, mask in zip(chunks, self.pictures.split(_CHUNK), self.masks.split(_CHUNK), strict=True):
+        colors = self.pictures[:, :3]
+        for pictures, truth, mask in zip(chunks, colors.split(_CHUNK), self.masks.split(_CHUNK), strict=True):
+            shown = pictures[:, :3]
             rows["mae"].append(image_mae(shown, truth))
             rows["ssim"].append(image_ssim(shown, truth))
             rows["mae_masked"].append(masked_mae(shown, truth, mask))

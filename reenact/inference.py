@@ -26,13 +26,12 @@ _CHUNK = 64
 class ImageRetargeter:
     """Moves motion from `source` to `target` through a shared picture space."""
 
-    def __init__(self, config: Config, source: Studio, target: Studio, networks: Networks, target_key: str):
-        """`source` and `target` must be studios of the run that trained the networks; see `load`."""
+    def __init__(self, config: Config, source: Studio, target: Studio, networks: Networks, keys: tuple[str, str]):
+        """`source` and `target` must be studios of the run that trained the networks, `keys` their keys; see `load`."""
         self.config = config
         self.source, self.target = source.rig, target.rig
         self.source_studio, self.target_studio = source, target
-        self._draw = lambda seen: networks.reenactnet(seen, target_key)
-        self._read = networks.bpnets[target_key]
+        self.networks, self.keys = networks, keys
 
     @classmethod
     def load(cls, folder: Path | str, reverse: bool = False) -> ImageRetargeter:
@@ -45,7 +44,7 @@ class ImageRetargeter:
         run = Run.open(folder)
         networks = run.trained_networks()
         source, target = run.keys[:2][::-1] if reverse else run.keys[:2]
-        return cls(run.config, run.studio(source), run.studio(target), networks, target)
+        return cls(run.config, run.studio(source), run.studio(target), networks, (source, target))
 
     @torch.inference_mode()
     def __call__(self, clip: Clip) -> Clip:
@@ -59,20 +58,24 @@ class ImageRetargeter:
                 f"clip: expected the {len(self.source.names)} names of {self.source.name} in their order, got "
                 f"{', '.join(clip.names[:3])} and so on; `reenact.rigs.files.conform` gives it those"
             )
-        weights = [self.read(self.reenact(self.source_pictures(chunk))) for chunk in clip.weights.split(_CHUNK)]
+        weights = [self._retarget(chunk) for chunk in clip.weights.split(_CHUNK)]
         return Clip(self.target.names, torch.cat(weights), clip.fps)
 
+    @torch.inference_mode()
     def step(self, weights: Float[Tensor, "Ks"]) -> Float[Tensor, "Kt"]:
         """Weights of one frame, in [0, 1]; the same as in a clip."""
-        with torch.inference_mode():
-            return self.read(self.reenact(self.source_pictures(weights[None])))[0]
+        return self._retarget(weights[None])[0]
 
-    def source_pictures(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N 3 R R"]:
-        """The source as the networks see it, before its neutral is subtracted."""
+    def _retarget(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"]:
+        """As `read` of `reenact` of `source_pictures`, without drawing colours that nobody looks at."""
+        return self.networks.retarget(self.source_studio.glance(weights), *self.keys).clamp(0, 1)
+
+    def source_pictures(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N C R R"]:
+        """The source as the networks see it, before its neutral is subtracted: colours, then the motion pass."""
         return self.source_studio.photograph(weights)
 
-    def target_pictures(self, weights: Float[Tensor, "N Kt"]) -> Float[Tensor, "N 3 R R"]:
-        """The target in the shared layout."""
+    def target_pictures(self, weights: Float[Tensor, "N Kt"]) -> Float[Tensor, "N C R R"]:
+        """The target in the shared layout: colours, then the motion pass."""
         return self.target_studio.photograph(weights)
 
     def source_masks(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N 1 R R"]:
@@ -84,16 +87,16 @@ class ImageRetargeter:
         return self.target_studio.photograph(weights, ("mask",))
 
     @torch.inference_mode()
-    def reenact(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N 3 R R"]:
-        """Pictures of the source redrawn as the target, in the shared layout, in [0, 1]."""
-        return self.target_studio.picture(self._draw(self.source_studio.level(self.source_studio.show(pictures))))
+    def reenact(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N C R R"]:
+        """Pictures of the source redrawn as the target, in the shared layout, colours in [0, 1]."""
+        return self.target_studio.picture(self.networks.redraw(self.source_studio.show(pictures), *self.keys))
 
     @torch.inference_mode()
-    def read(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N Kt"]:
+    def read(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N Kt"]:
         """Weights of the target that make the pictures, clamped to [0, 1]."""
-        return self._read(self.target_studio.show(pictures)).clamp(0, 1)
+        return self.networks.read(self.target_studio.show(pictures), self.keys[1]).clamp(0, 1)
 
     @torch.inference_mode()
-    def read_direct(self, pictures: Float[Tensor, "N 3 R R"]) -> Float[Tensor, "N Kt"]:
+    def read_direct(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N Kt"]:
         """Weights read from the source's own pictures by the target's BPNet: what ReenactNet has to beat."""
-        return self._read(self.source_studio.show(pictures)).clamp(0, 1)
+        return self.networks.read(self.source_studio.show(pictures), self.keys[1]).clamp(0, 1)

@@ -3,14 +3,24 @@
 Kim, Jung, Yun, Seo, Noh 2021, "Deep Learning-Based Unsupervised Human Facial Retargeting", CGF 40(7),
 doi:10.1111/cgf.14400 (KI21).
 
-Paper   Code                        Shape
-E       ReenactNet.encode           (B, C, R, R) -> (B, D) or (B, A, R / 8, R / 8)
-D_s,t   ReenactNet.decoders[key]    (B, D) or (B, A, R / 8, R / 8) -> (B, C, R, R)
-BPNet   BPNet                       (B, C, R, R) -> (B, K)
+Paper   Code                              Shape
+E       ReenactNet.encode                 readable part of descriptions -> (B, D) or (B, A, R / 8, R / 8)
+D_s,t   ReenactNet.decoders[key]          -> descriptions of pictures of the rig `key`
+BPNet   BPNet                             readable part of descriptions -> (B, K)
 
-The paper names the family (shared encoder, one decoder per face, from the "deepfake" line) and leaves layers and sizes
-to a supplement that is not public; every layer below is our choice within that family. There are no skip connections
-from encoder to decoder: they would carry the source's identity past the code.
+There are two ReenactNets, and a BPNet for each. `ConvolutionalReenactNet` is the published family (shared encoder, one
+decoder per face, from the "deepfake" line); the paper leaves layers and sizes to a supplement that is not public, so
+every layer is our choice. `ComponentReenactNet`, the default, is ours: it works between the principal components of
+each rig's pictures. Both answer the same calls:
+
+    description = net.describe(key, shown)    pictures as the network holds them: mixtures of components, or themselves
+    readable = net.readable(description)      the part that is read from: without the colours, where motion is known
+    drawn = net(readable, source, target)     the same expression, described as a picture of another rig
+    net.distances(key, drawn, description)    (B,), how far apart two descriptions are
+    shown = net.depict(key, drawn)            the picture behind a description
+
+Pictures are what `Studio.show` makes of them: (B, C, R, R), colours and, where `images.motion` asks for it, the motion
+pass behind them. There are no skip connections past the code: they would carry the source's identity along.
 """
 
 from __future__ import annotations
@@ -18,113 +28,384 @@ from __future__ import annotations
 from itertools import pairwise
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
+from kornia.filters import gaussian_blur2d
 from torch import Tensor, nn
 
 from reenact.config import BPNetConfig, Config, ReenactNetConfig
 
+READ = 3
+"""Channels that are read from, the last ones of a picture: its motion pass, or its colours if it has no other."""
+_SPREAD = 4.0
+"""Standard deviation of the strongest component in a description; activations of that size train well."""
+_COMMON = 1200
+"""Pictures of each rig from which the components that the encoder sees are taken."""
 
-class ReenactNet(nn.Module):
-    """One shared encoder, one decoder per rig.
 
-    Pictures are residuals against the neutral, of unit size on average, or colours in [0, 1] where `residual` is False.
+class Eigenpictures(nn.Module):
+    """Pictures of one rig as mixtures of the principal components of its own pictures.
+
+    A few hundred components hold 99 % of what a rig's pictures show, more where they show motion. Pixels are weighted,
+    so that the squared distance of two mixtures is the weighted squared distance of the pictures (Parseval). Until
+    `fit`, every picture is described by zeros and drawn as the zero picture.
+
+    Source: Turk & Pentland 1991, "Eigenfaces for Recognition", doi:10.1162/jocn.1991.3.1.71; residuals and weights are
+    ours.
     """
 
-    def __init__(self, keys: list[str], resolution: int, config: ReenactNetConfig, residual: bool = True):
+    def __init__(self, count: int, resolution: int):
         super().__init__()
-        channels, seed = config.encoder_channels, config.seed_channels
-        layer = _Layer(config.normalize)
-        small = resolution // 16
-        self.trunk = nn.Sequential(
-            layer.down(3, channels, config.kernel),
-            layer.down(channels, 2 * channels, config.kernel),
-            layer.down(2 * channels, 4 * channels, config.kernel),
-            layer.down(4 * channels, 8 * channels, config.kernel),
-            nn.Flatten(),
-            nn.Linear(8 * channels * small * small, config.code),
-        )
-        if config.decoder == "basis":
-            width = config.decoder_width
-            self.unfold = nn.Sequential(nn.Linear(config.code, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU())
-            self.decoders = nn.ModuleDict({key: BasisDecoder(resolution, config) for key in keys})
-        else:
-            self.unfold = nn.Sequential(
-                nn.Linear(config.code, seed * small * small),
-                nn.Unflatten(1, (seed, small, small)),
-                layer.up(seed, seed),
-            )
-            self.decoders = nn.ModuleDict({key: _decoder(seed, config, layer, residual) for key in keys})
-
-    def encode(self, pictures: Float[Tensor, "B C R R"]) -> Float[Tensor, "B *shape"]:
-        """The expression as every decoder understands it: E. Features (B, D), or a small picture."""
-        return self.unfold(self.trunk(pictures))
-
-    def code(self, pictures: Float[Tensor, "B C R R"]) -> Float[Tensor, "B D"]:
-        """The bottleneck, where equal expressions of two rigs should meet."""
-        return self.trunk(pictures)
-
-    def forward(self, pictures: Float[Tensor, "B C R R"], key: str) -> Float[Tensor, "B C R R"]:
-        """The expression of the pictures, drawn on the rig `key`. Source: KI21, ReenactNet(I) = D_t(E(I))."""
-        return self.decoders[key](self.encode(pictures))
-
-
-class BasisDecoder(nn.Module):
-    """A decoder that mixes the principal components of its rig's own pictures. Ours.
-
-    Where a convolutional decoder learns to draw from nothing, this one is told what the rig's pictures can look like: a
-    few hundred components hold 99 % of their variance, one dense layer finds the mixture, and a step costs a quarter.
-    All that is nonlinear stays in the part that the rigs share, which keeps their codes together. Until `fit` it draws
-    the zero picture.
-    """
-
-    def __init__(self, resolution: int, config: ReenactNetConfig):
-        super().__init__()
-        count = config.components
+        size = READ * resolution * resolution
         self.resolution = resolution
-        self.mix = nn.Linear(config.decoder_width, count)
-        self.register_buffer("mean", torch.zeros(3 * resolution * resolution))
-        self.register_buffer("components", torch.zeros(count, 3 * resolution * resolution))
+        self.register_buffer("weight", torch.ones(size))
+        self.register_buffer("mean", torch.zeros(size))
+        self.register_buffer("components", torch.zeros(count, size))
+        self.register_buffer("unit", torch.ones(()))
+        self.register_buffer("importance", torch.zeros(count))
 
-    def forward(self, features: Float[Tensor, "B D"]) -> Float[Tensor, "B 3 R R"]:
-        """Pictures; each component is scaled by how much it varies, so that mixtures are of unit size."""
-        flat = torch.addmm(self.mean, self.mix(features), self.components)
-        return flat.unflatten(1, (3, self.resolution, self.resolution))
+    def describe(self, shown: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B N"]:
+        """The mixture that comes closest to each picture."""
+        return (shown.flatten(1) * self.weight - self.mean) @ self.components.T / self.unit
+
+    def depict(self, mixtures: Float[Tensor, "B N"]) -> Float[Tensor, "B 3 R R"]:
+        """The picture of each mixture."""
+        flat = torch.addmm(self.mean, mixtures * self.unit, self.components) / self.weight
+        return flat.unflatten(1, (READ, self.resolution, self.resolution))
+
+    def distances(self, a: Float[Tensor, "B N"], b: Float[Tensor, "B N"]) -> Float[Tensor, "B"]:
+        """Distances in units of the pictures' own deviation: 1 is as far as a typical picture from the mean one.
+
+        Components of little energy count more than their share: a blink moves few pixels.
+        """
+        return ((a - b).square() @ self.importance + 1e-8).sqrt()
 
     @torch.no_grad()
-    def fit(self, pictures: Float[Tensor, "N 3 R R"]) -> float:
-        """The share of variance that the components hold, which are taken from these pictures of the rig.
+    def fit(self, shown: Float[Tensor, "N 3 R R"], weight: Float[Tensor, "1 R R"]) -> float:
+        """The share of the weighted variance that the components hold, which are taken from these pictures.
 
         With fewer pictures than components the rest stay zero.
         """
-        flat = pictures.flatten(1)
+        self.weight.copy_(weight.sqrt().expand(READ, -1, -1).flatten())
+        flat = shown.flatten(1) * self.weight
         self.mean.copy_(flat.mean(0))
-        centred = flat - self.mean
-        values, vectors = torch.linalg.eigh((centred @ centred.T).double())  # of the small side, ascending
+        flat -= self.mean
+        double = flat.double()  # energies span six orders of magnitude, float32 sums would drown the last components
+        values, vectors = torch.linalg.eigh(double @ double.T)  # of the small side, ascending
         count = min(len(self.components), len(flat) - 1)
         values, vectors = values.flip(0).clamp_min(0), vectors.flip(1)
-        # Rows of U^T X are components times singular values; over sqrt(N) they are components times deviations.
-        self.components[:count] = (vectors[:, :count].T.float() @ centred) / len(flat) ** 0.5
-        return float(values[:count].sum() / values.sum().clamp_min(1e-12))
+        kept = values[:count] > 1e-9 * values[0]
+        rows = (vectors[:, :count].T @ double) * kept[:, None]  # U^T X: components times singular values
+        self.components.zero_()
+        self.components[:count] = F.normalize(rows, dim=1).float()
+        deviations = (values[:count] * kept / len(flat)).sqrt().float()
+        self.unit.copy_(deviations[0] / _SPREAD)
+        even = torch.where(kept, deviations.clamp_min(1e-12).rsqrt(), 0.0)  # 1 / sqrt: energies become deviations
+        self.importance.zero_()
+        self.importance[:count] = even * self.unit**2 / (even * deviations.square()).sum()
+        return float((values[:count] * kept).sum() / values.sum().clamp_min(1e-12))
 
 
-class BPNet(nn.Module):
-    """Blendshape weights of one rig from its picture. Linear output: clamp to [0, 1] at inference, not in training."""
+class ComponentReenactNet(nn.Module):
+    """One shared encoder and one linear decoder per rig, from principal components to principal components. Ours.
 
-    def __init__(self, shape_count: int, resolution: int, config: BPNetConfig):
+    A motion pass is nearly linear in the weights, which a convolutional network has to discover and this one is built
+    for: straight maps beside every dense layer. A step costs a hundredth. All that is nonlinear stays in the part that
+    the rigs share, which keeps their codes together.
+    """
+
+    def __init__(self, keys: list[str], resolution: int, config: ReenactNetConfig, colored: bool):
+        """`colored`: pictures have colours besides what is read from them."""
         super().__init__()
-        sizes = [3, *(config.channels * factor for factor in (1, 2, 4, 8))]
-        blocks = []
-        for size_in, size_out in pairwise(sizes):
-            blocks += [nn.Conv2d(size_in, size_out, 3, 2, 1), nn.GroupNorm(8, size_out), nn.SiLU()]
+        self.count = config.components
+        sizes = [config.components] + [config.color_components] * colored
+        self.bases = nn.ModuleDict({key: nn.ModuleList(Eigenpictures(n, resolution) for n in sizes) for key in keys})
+        # Each rig's mixtures as mixtures of components that all rigs share, of pictures that vary everywhere alike.
+        self.to_common = nn.ModuleDict({key: _Affine(self.count, 2 * self.count) for key in keys})
+        self.trunk = Perceptron(2 * self.count, config.width, config.code)
+        self.unfold = Perceptron(config.code, config.width, config.width)
+        self.decoders = nn.ModuleDict({key: nn.Linear(config.width, sum(sizes)) for key in keys})
+
+    def describe(self, key: str, shown: Float[Tensor, "B C R R"]) -> Float[Tensor, "B N"]:
+        """Mixtures of the rig's components; those of its colours come last, and are left out if the picture is."""
+        blocks = [shown[:, -READ:], shown[:, :READ]][: shown.shape[1] // READ]
+        return torch.cat([basis.describe(block) for basis, block in zip(self.bases[key], blocks)], dim=1)
+
+    def depict(self, key: str, description: Float[Tensor, "B N"]) -> Float[Tensor, "B C R R"]:
+        """Pictures, as `Studio.show` makes them."""
+        blocks = description.split([len(basis.components) for basis in self.bases[key]], dim=1)
+        return torch.cat([basis.depict(block) for basis, block in zip(self.bases[key], blocks)][::-1], dim=1)
+
+    def readable(self, description: Float[Tensor, "B N"]) -> Float[Tensor, "B M"]:
+        """Mixtures of what is read from, without the colours beside it."""
+        return description[:, : self.count]
+
+    def encode(self, readable: Float[Tensor, "B M"], key: str) -> Float[Tensor, "B D"]:
+        """The expression as every decoder understands it: E."""
+        return self.unfold(self.code(readable, key))
+
+    def code(self, readable: Float[Tensor, "B M"], key: str) -> Float[Tensor, "B D"]:
+        """The bottleneck, where equal expressions of two rigs should meet."""
+        return self.trunk(self.to_common[key](readable))
+
+    def forward(self, readable: Float[Tensor, "B M"], source: str, target: str) -> Float[Tensor, "B N"]:
+        """The source's expression, described as a picture of the target. Source: KI21, ReenactNet(I) = D_t(E(I))."""
+        return self.decoders[target](self.encode(readable, source))
+
+    def distances(self, key: str, a: Float[Tensor, "B N"], b: Float[Tensor, "B N"]) -> Float[Tensor, "B"]:
+        """Mean over what is read and colours, each in units of its own energy; see `Eigenpictures.distances`."""
+        sizes = [len(basis.components) for basis in self.bases[key]]
+        parts = zip(self.bases[key], a.split(sizes, dim=1), b.split(sizes, dim=1))
+        return torch.stack([basis.distances(*block) for basis, *block in parts]).mean(0)
+
+    @torch.no_grad()
+    def fit(self, shown: dict[str, Float[Tensor, "N C R R"]]) -> None:
+        """Take the components from pictures of each rig."""
+        for key, pictures in shown.items():
+            for basis, block in zip(self.bases[key], (pictures[:, -READ:], pictures[:, :READ])):
+                basis.fit(block, motion_weight(block))
+        energies = {key: energy(pictures[:, -READ:]).flatten() for key, pictures in shown.items()}
+        level = {key: pictures[:_COMMON, -READ:].flatten(1) / energies[key] for key, pictures in shown.items()}
+        common = Eigenpictures(2 * self.count, self.bases[next(iter(shown))][0].resolution)
+        common.fit(
+            torch.cat(list(level.values())).unflatten(1, (READ, common.resolution, common.resolution)),
+            torch.ones(1, common.resolution, common.resolution),
+        )
+        for key in shown:
+            basis = self.bases[key][0]
+            place = basis.weight * energies[key]
+            self.to_common[key].weight.copy_(
+                (basis.components * basis.unit / place) @ common.components.T / common.unit
+            )
+            self.to_common[key].bias.copy_((basis.mean / place - common.mean) @ common.components.T / common.unit)
+
+
+class ConvolutionalReenactNet(nn.Module):
+    """One shared convolutional encoder, one convolutional decoder per rig: the published family."""
+
+    def __init__(
+        self,
+        keys: list[str],
+        resolution: int,
+        config: ReenactNetConfig,
+        channels: int,
+        loss: str,
+        residual: bool = True,
+    ):
+        """`channels` of the pictures that it draws; `loss` and `residual` as in the settings."""
+        super().__init__()
+        self.squared = loss == "l1+l2"
+        first, seed = config.encoder_channels, config.seed_channels
+        layer = _Layer(config.normalize)
         small = resolution // 16
-        self.features = nn.Sequential(*blocks, nn.Flatten())
-        self.head = nn.Sequential(
-            nn.Linear(sizes[-1] * small * small, config.hidden), nn.SiLU(), nn.Linear(config.hidden, shape_count)
+        self.trunk = nn.Sequential(
+            layer.down(READ, first, config.kernel),
+            layer.down(first, 2 * first, config.kernel),
+            layer.down(2 * first, 4 * first, config.kernel),
+            layer.down(4 * first, 8 * first, config.kernel),
+            nn.Flatten(),
+            nn.Linear(8 * first * small * small, config.code),
+        )
+        self.unfold = nn.Sequential(
+            nn.Linear(config.code, seed * small * small),
+            nn.Unflatten(1, (seed, small, small)),
+            layer.up(seed, seed),
+        )
+        self.decoders = nn.ModuleDict({key: _decoder(seed, config, layer, channels, residual) for key in keys})
+        self.scales = nn.ModuleDict({key: _Scales(channels, resolution) for key in keys})
+
+    def describe(self, key: str, shown: Float[Tensor, "B C R R"]) -> Float[Tensor, "B C R R"]:
+        """The pictures themselves."""
+        return shown
+
+    def depict(self, key: str, description: Float[Tensor, "B C R R"]) -> Float[Tensor, "B C R R"]:
+        """The pictures themselves."""
+        return description
+
+    def readable(self, description: Float[Tensor, "B C R R"]) -> Float[Tensor, "B 3 R R"]:
+        """The channels that are read from."""
+        return description[:, -READ:]
+
+    def encode(self, readable: Float[Tensor, "B 3 R R"], key: str) -> Float[Tensor, "B A r r"]:
+        """The expression as every decoder understands it, a small picture: E."""
+        return self.unfold(self.code(readable, key))
+
+    def code(self, readable: Float[Tensor, "B 3 R R"], key: str) -> Float[Tensor, "B D"]:
+        """The bottleneck, where equal expressions of two rigs should meet."""
+        return self.trunk(readable / self.scales[key].energy)
+
+    def forward(self, readable: Float[Tensor, "B 3 R R"], source: str, target: str) -> Float[Tensor, "B C R R"]:
+        """The source's expression as a picture of the target. Source: KI21, ReenactNet(I) = D_t(E(I))."""
+        return self.decoders[target](self.encode(readable, source))
+
+    def distances(self, key: str, a: Float[Tensor, "B C R R"], b: Float[Tensor, "B C R R"]) -> Float[Tensor, "B"]:
+        """Mean absolute difference, where asked plus squares, weighted by where the rig moves. Source: KI21, L_recon.
+
+        The paper does not state the reduction. Squares are ours: where most pixels are still, the median that an
+        absolute difference asks for is the still picture.
+        """
+        difference = (a - b).abs()
+        if self.squared:
+            difference = difference + difference.square()
+        return (difference * self.scales[key].emphasis).mean((1, 2, 3))
+
+    @torch.no_grad()
+    def fit(self, shown: dict[str, Float[Tensor, "N C R R"]], leveled: bool, weighted: bool) -> None:
+        """Measure where each rig's pictures vary.
+
+        Args:
+            shown: Pictures of each rig.
+            leveled: The encoder sees each place and channel divided by how much it varies.
+            weighted: Distances count pixels by how much they move.
+        """
+        for key, pictures in shown.items():
+            if leveled:
+                self.scales[key].energy.copy_(energy(pictures[:, -READ:]))
+            if weighted:
+                blocks = pictures.split(READ, dim=1)
+                self.scales[key].emphasis.copy_(
+                    torch.cat([motion_weight(block).expand(READ, -1, -1) for block in blocks])
+                )
+
+
+class Perceptron(nn.Module):
+    """Two hidden layers, and a straight map beside them: what is linear need not be learnt the hard way."""
+
+    def __init__(self, size_in: int, width: int, size_out: int):
+        super().__init__()
+        self.straight = nn.Linear(size_in, size_out)
+        self.bent = nn.Sequential(
+            nn.Linear(size_in, width), nn.SiLU(), nn.Linear(width, width), nn.SiLU(), nn.Linear(width, size_out)
         )
 
-    def forward(self, pictures: Float[Tensor, "B C R R"]) -> Float[Tensor, "B K"]:
-        """Weights, unbounded. GroupNorm, since batches are small and decoded pictures differ from rendered ones."""
-        return self.head(self.features(pictures))
+    def forward(self, x: Float[Tensor, "B N"]) -> Float[Tensor, "B M"]:
+        return self.straight(x) + self.bent(x)
+
+
+def component_bpnet(shape_count: int, components: int, config: BPNetConfig) -> nn.Module:
+    """Reads blendshape weights from a mixture of components: (B, M) -> (B, K), unbounded. Ours."""
+    return Perceptron(components, config.hidden, shape_count)
+
+
+def convolutional_bpnet(shape_count: int, resolution: int, config: BPNetConfig) -> nn.Module:
+    """Reads blendshape weights from a picture: (B, 3, R, R) -> (B, K), unbounded: clamp at inference, not in training.
+
+    GroupNorm, since batches are small and drawn pictures differ from rendered ones.
+    """
+    sizes = [READ, *(config.channels * factor for factor in (1, 2, 4, 8))]
+    blocks: list[nn.Module] = []
+    for size_in, size_out in pairwise(sizes):
+        blocks += [nn.Conv2d(size_in, size_out, 3, 2, 1), nn.GroupNorm(8, size_out), nn.SiLU()]
+    small = resolution // 16
+    return nn.Sequential(
+        *blocks,
+        nn.Flatten(),
+        nn.Linear(sizes[-1] * small * small, config.hidden),
+        nn.SiLU(),
+        nn.Linear(config.hidden, shape_count),
+    )
+
+
+class Networks(nn.Module):
+    """Everything that a run trains: one ReenactNet, and a BPNet per rig, keyed alike."""
+
+    def __init__(self, shape_counts: dict[str, int], config: Config):
+        super().__init__()
+        keys, resolution, settings = list(shape_counts), config.images.resolution, config.reenactnet
+        if settings.network == "components":
+            self.reenactnet = ComponentReenactNet(keys, resolution, settings, colored=config.images.motion)
+            read = {key: component_bpnet(n, settings.components, config.bpnet) for key, n in shape_counts.items()}
+        else:
+            channels = 2 * READ if config.images.motion else READ
+            self.reenactnet = ConvolutionalReenactNet(
+                keys, resolution, settings, channels, config.training.loss, config.images.residual
+            )
+            read = {key: convolutional_bpnet(n, resolution, config.bpnet) for key, n in shape_counts.items()}
+        self.bpnets = nn.ModuleDict(read)
+        self.config = config
+
+    def fit(self, shown: dict[str, Float[Tensor, "N C R R"]]) -> None:
+        """Take from pictures of each rig what the networks know of them before any training."""
+        if isinstance(self.reenactnet, ComponentReenactNet):
+            self.reenactnet.fit(shown)
+        else:
+            self.reenactnet.fit(shown, self.config.images.residual, self.config.training.motion_weighting)
+
+    def retarget(self, shown: Float[Tensor, "B C R R"], source: str, target: str) -> Float[Tensor, "B K"]:
+        """The target's weights for pictures of the source, unbounded; colours may be left out where motion is shown."""
+        net = self.reenactnet
+        drawn = net(net.readable(net.describe(source, shown)), source, target)
+        return self.bpnets[target](net.readable(drawn))
+
+    def redraw(self, shown: Float[Tensor, "B C R R"], source: str, target: str) -> Float[Tensor, "B C R R"]:
+        """The source's pictures drawn as the target."""
+        net = self.reenactnet
+        return net.depict(target, net(net.readable(net.describe(source, shown)), source, target))
+
+    def read(self, shown: Float[Tensor, "B C R R"], key: str) -> Float[Tensor, "B K"]:
+        """Weights of a rig from its own pictures, unbounded."""
+        net = self.reenactnet
+        return self.bpnets[key](net.readable(net.describe(key, shown)))
+
+
+def motion_weight(residuals: Float[Tensor, "N C R R"]) -> Float[Tensor, "1 R R"]:
+    """Where a rig's pictures move: mean absolute residual per pixel over its mean, clamped to [0.2, 4]. Ours."""
+    energy = residuals.abs().mean(dim=(0, 1), keepdim=True)[0]
+    return (energy / energy.mean().clamp_min(1e-12)).clamp(0.2, 4.0)
+
+
+def energy(residuals: Float[Tensor, "N C R R"]) -> Float[Tensor, "C R R"]:
+    """Smoothed root mean square residual of each pixel and channel, over the channel's mean; at least 0.15. Ours.
+
+    What the encoder sees is divided by it: dark lips on pale skin and red lips on dark skin, a long jaw and a short one
+    move alike and look unlike; after this, less so.
+    """
+    resolution = residuals.shape[-1]
+    sigma, size = resolution / 32, 2 * (resolution // 16) + 1
+    smooth = gaussian_blur2d(residuals.square().mean(0, keepdim=True), (size, size), (sigma, sigma))[0].sqrt()
+    return (smooth / smooth.mean(dim=(1, 2), keepdim=True).clamp_min(1e-9)).clamp_min(0.15)
+
+
+def parameter_count(module: nn.Module) -> int:
+    """Trainable numbers in a network."""
+    return sum(p.numel() for p in module.parameters() if p.requires_grad)
+
+
+def forward_macs(module: nn.Module, *example: Tensor | str) -> int:
+    """Multiply-accumulates of one forward pass, counted on the convolutions and dense layers that ran."""
+    total = 0
+
+    def count(layer: nn.Module, _inputs: tuple, output: Tensor) -> None:
+        nonlocal total
+        total += output.numel() // len(output) * layer.weight[0].numel()
+
+    hooks = [m.register_forward_hook(count) for m in module.modules() if isinstance(m, nn.Conv2d | nn.Linear)]
+    with torch.no_grad():
+        module(*example)
+    for hook in hooks:
+        hook.remove()
+    return total
+
+
+class _Affine(nn.Module):
+    """A fixed map x W + b, not trained."""
+
+    def __init__(self, size_in: int, size_out: int):
+        super().__init__()
+        self.register_buffer("weight", torch.zeros(size_in, size_out))
+        self.register_buffer("bias", torch.zeros(size_out))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.addmm(self.bias, x, self.weight)
+
+
+class _Scales(nn.Module):
+    """How much each place of a rig's pictures varies, and how much it counts."""
+
+    def __init__(self, channels: int, resolution: int):
+        super().__init__()
+        self.register_buffer("energy", torch.ones(READ, resolution, resolution))
+        self.register_buffer("emphasis", torch.ones(channels, resolution, resolution))
 
 
 class _Layer:
@@ -159,7 +440,7 @@ class _Residual(nn.Module):
         return self.finish(x + self.body(x))
 
 
-def _decoder(seed: int, config: ReenactNetConfig, layer: _Layer, residual: bool) -> nn.Sequential:
+def _decoder(seed: int, config: ReenactNetConfig, layer: _Layer, channels: int, residual: bool) -> nn.Sequential:
     """Three doublings from R / 8, the last without blocks of their own; linear for residuals, sigmoid for colours."""
     blocks, size = [], seed
     for index in range(config.decoder_blocks):
@@ -168,40 +449,7 @@ def _decoder(seed: int, config: ReenactNetConfig, layer: _Layer, residual: bool)
         size = wide
     rest = 2 ** (3 - config.decoder_blocks)
     if rest == 1:
-        blocks.append(nn.Conv2d(size, 3, 1))
+        blocks.append(nn.Conv2d(size, channels, 1))
     else:
-        blocks += [nn.Conv2d(size, 3 * rest * rest, 3, 1, 1), nn.PixelShuffle(rest)]
+        blocks += [nn.Conv2d(size, channels * rest * rest, 3, 1, 1), nn.PixelShuffle(rest)]
     return nn.Sequential(*blocks, nn.Identity() if residual else nn.Sigmoid())
-
-
-def parameter_count(module: nn.Module) -> int:
-    """Trainable numbers in a network."""
-    return sum(p.numel() for p in module.parameters() if p.requires_grad)
-
-
-def forward_macs(module: nn.Module, *example: Tensor | str) -> int:
-    """Multiply-accumulates of one forward pass, counted on the convolutions and dense layers that ran."""
-    total = 0
-
-    def count(layer: nn.Module, _inputs: tuple, output: Tensor) -> None:
-        nonlocal total
-        total += output.numel() // len(output) * layer.weight[0].numel()
-
-    hooks = [m.register_forward_hook(count) for m in module.modules() if isinstance(m, nn.Conv2d | nn.Linear)]
-    with torch.no_grad():
-        module(*example)
-    for hook in hooks:
-        hook.remove()
-    return total
-
-
-class Networks(nn.Module):
-    """Everything that a run trains: one ReenactNet, and a BPNet per rig, keyed alike."""
-
-    def __init__(self, shape_counts: dict[str, int], config: Config):
-        super().__init__()
-        resolution, residual = config.images.resolution, config.images.residual
-        self.reenactnet = ReenactNet(list(shape_counts), resolution, config.reenactnet, residual)
-        self.bpnets = nn.ModuleDict(
-            {key: BPNet(count, resolution, config.bpnet) for key, count in shape_counts.items()}
-        )

@@ -91,13 +91,14 @@ class Portrait:
         Args:
             vertices: In the rig's own frame, metres.
             resolution: Height and width in pixels.
-            buffers: Any of "color", "mask", "normals", "depth", "parts"; see `render.render`.
+            buffers: Any of "color", "mask", "normals", "depth", "parts", as `render.render` makes them; and "motion",
+                how far each visible point is from where it rests, (x, y, z) in metres of an adult's face, 0 outside.
 
         Returns:
             Buffer name to (B, C, resolution, resolution).
         """
         rig = self.rig
-        return render(
+        made = render(
             self.scale * vertices + self.position,
             rig.faces,
             self.camera,
@@ -109,9 +110,11 @@ class Portrait:
             uv=rig.uv,
             uv_faces=rig.uv_faces,
             parts=rig.parts,
+            attributes=self.scale * (vertices - rig.neutral) if "motion" in buffers else None,
             background=BACKGROUND,
-            buffers=buffers,
+            buffers=["attributes" if name == "motion" else name for name in buffers],
         )
+        return {name: made["attributes" if name == "motion" else name] for name in buffers}
 
     def project(self, vertices: Float[Tensor, "*batch V 3"], resolution: int) -> Float[Tensor, "*batch V 2"]:
         """Pixel coordinates (x, y) of vertices; (0, 0) is the top left corner of the top left pixel."""

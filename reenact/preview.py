@@ -34,14 +34,14 @@ def save_preview(path: Path, studios: dict[str, Studio], networks: Networks, tra
     columns = [source.photograph(weights)]
     for key in target_keys:
         target = studios[key]
-        drawn = networks.reenactnet(source.level(source.show(columns[0])), key)
-        columns.append(target.picture(drawn))
+        shown = source.show(columns[0])
+        columns.append(target.picture(networks.redraw(shown, source_key, key)))
         if key in trained:
-            columns.append(target.photograph(networks.bpnets[key](drawn).clamp(0, 1)))
+            columns.append(target.photograph(networks.retarget(shown, source_key, key).clamp(0, 1)))
         truth = shared_weights(weights, source.rig.names, target.rig.names)
         if truth is not None:
             columns.append(target.photograph(truth))
-    save_contact_sheet(path, columns)
+    save_contact_sheet(path, [pictures[:, :3] for pictures in columns])
 
 
 def shared_weights(weights: Tensor, source_names: tuple[str, ...], target_names: tuple[str, ...]) -> Tensor | None:

@@ -381,7 +381,7 @@ def _sheet(
 ) -> dict[str, Any]:
     source = arrays.get("truth_source", arrays["source"])[frames]
     predicted = arrays.get("truth_predicted", arrays["predicted"])[frames]
-    drawn = forward.reenact(forward.source_pictures(torch.from_numpy(source))).clamp(0, 1)
+    drawn = forward.reenact(forward.source_pictures(torch.from_numpy(source)))[:, :3].clamp(0, 1)
     rows = [
         (f"source, {forward.source.name}", _faces(forward.source, source, SHEET_SIZE)),
         ("what ReenactNet draws", _bytes(drawn)),

@@ -4,6 +4,7 @@ config.toml          every setting, resolved
 rigs/0-man.npz ...   the rigs as they were; the first is the source, whose layout all others share
 clips/0-man.npz ...  training motion of the rigs that were given some
 layouts.safetensors  sampling grid of each other rig
+pairs.json           which shapes of the rigs were found to do the same
 metrics.jsonl        losses by stage and step
 checkpoints/         networks, optimizer, position; see `reenact.checkpoint`
 previews/            pictures drawn at each save
@@ -121,7 +122,6 @@ class Run:
             config.images,
             self.layouts.get(key),
             clip,
-            config.training.fixed_frames,
             seed=1000 * config.training.seed + index,
         )
 

@@ -1,9 +1,10 @@
 """train(): the one loop, for ReenactNet and for each rig's BPNet.
 
 Kim et al. 2021 (KI21), "Deep Learning-Based Unsupervised Human Facial Retargeting", doi:10.1111/cgf.14400,
-sections 3.2 and 3.3. Training goes through stages: ReenactNet first, then one BPNet per rig, so
-that each BPNet can learn from pictures as ReenactNet draws them. Every random number of a step comes from (seed, stage,
-step): the position in the data is the step, and a resumed run takes the same next step as an unbroken one.
+sections 3.2 and 3.3. Training goes through stages: ReenactNet first, then one BPNet per rig, so that each BPNet can
+learn from pictures as ReenactNet draws them. A stage renders some thousand expressions of each rig at a time, describes
+them once (`reenact.models`), and takes its batches from there until it renders others. Every random number comes from
+(seed, stage, step): a resumed run takes the same next step as an unbroken one.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -29,15 +30,16 @@ from reenact.checkpoint import RunLock, flatten_optimizer, load_checkpoint, rest
 from reenact.config import Config
 from reenact.data import Studio, jitter
 from reenact.errors import ReenactError
-from reenact.losses import picture_distance, weight_distance
+from reenact.losses import VertexDistance, weight_distance
 from reenact.models import Networks
+from reenact.pairs import Pairs, find_pairs
 from reenact.preview import save_preview
 from reenact.run import Run, restore_networks
 
-_PICTURES_PER_COMPONENT = 8
-"""Pictures of each rig, per principal component that a basis decoder takes from them."""
-_PICTURE_NOISE = 0.05
-"""Standard deviation of noise on what BPNet learns from, in units of what `Studio.show` makes."""
+_SURVEYED = 2048
+"""Pictures of each rig from which networks learn what varies, before any training."""
+_CHUNK = 64
+"""Expressions that are photographed at once; part of what makes a run repeatable."""
 _LOG_EVERY = 20
 """Steps between lines of metrics.jsonl; each holds the mean since the last."""
 
@@ -51,16 +53,42 @@ class _Stage:
     network: torch.nn.Module
     steps: int
     learning_rate: float
-    batch: Callable[[np.random.Generator], dict[str, _Batch]]
-    """Expressions of each rig that takes part, drawn with the given random numbers and photographed."""
-    losses: Callable[[dict[str, _Batch], torch.Generator], dict[str, Tensor]]
-    """Terms whose sum is minimised, on a batch that is jittered and blurred with the given random numbers."""
+    render: Callable[[list[int]], dict[str, _Pool]]
+    """Fresh expressions of the rigs that take part; the numbers seed them."""
+    losses: Callable[[dict[str, _Pool], torch.Generator, float], dict[str, Tensor]]
+    """Terms whose sum is minimised, on a batch from the pools; the share of the steps that are done."""
 
 
 @dataclass(frozen=True)
-class _Batch:
-    weights: Tensor  # (B, K)
-    pictures: Tensor  # (B, 3, R, R) in [0, 1]
+class _Pool:
+    """Expressions of one rig, rendered and described."""
+
+    weights: Tensor  # (N, K)
+    described: Tensor  # (N, ...), what decoders should draw
+    seen: Tensor  # (N, ...), what the encoder is given: the readable part, jittered
+    partners: dict[str, _Partners] = field(default_factory=dict)
+    """By key of another rig: how these expressions look there."""
+
+
+@dataclass(frozen=True)
+class _Partners:
+    """What another rig makes of the expressions of a pool."""
+
+    weights: Tensor  # (N, K)
+    described: Tensor | None  # (N, ...), where they are drawn
+    confidence: Tensor  # (N,)
+
+
+@dataclass(frozen=True)
+class _Workshop:
+    """All that the stages work with."""
+
+    config: Config
+    studios: dict[str, Studio]
+    networks: Networks
+    pairs: dict[tuple[str, str], Pairs]
+    """By (source, target); empty where the settings ask for none."""
+    vertex_distances: dict[str, VertexDistance]
 
 
 def train(config: Config, resume: bool = False) -> Path:
@@ -90,26 +118,28 @@ def train(config: Config, resume: bool = False) -> Path:
         with console.status("Photographing neutrals"):
             studios = {key: run.studio(key) for key in run.keys}
         networks = run.networks()
-        stages = _stages(config, studios, networks)
+        with console.status("Comparing shapes"):
+            pairs = _find_pairs(run, studios, console)
+        distances = {key: VertexDistance(studio.rig, studio.typical) for key, studio in studios.items()}
+        stages = _stages(_Workshop(config, studios, networks, pairs, distances))
         stage_index, first, optimizer = _restore(run, networks, stages) if resume else (0, 0, None)
-        if (stage_index, first) == (0, 0) and config.reenactnet.decoder == "basis":
-            pictures = _PICTURES_PER_COMPONENT * config.reenactnet.components
-            with console.status("Finding the components of each rig's pictures"):
-                for key, studio in studios.items():
-                    networks.reenactnet.decoders[key].fit(studio.show(studio.survey(pictures)))
+        if (stage_index, first) == (0, 0):
+            with console.status("Finding what varies in each rig's pictures"):
+                networks.fit({key: studio.show(studio.survey(_SURVEYED)) for key, studio in studios.items()})
         done = sum(stage.steps for stage in stages[:stage_index])
         with _progress(console) as show:
             for index, stage in list(enumerate(stages))[stage_index:]:
                 optimizer = optimizer or _optimizer(config, stage)
-                log, batch = _Log(run.folder / "metrics.jsonl", stage.name, first), None
+                log, pools = _Log(run.folder / "metrics.jsonl", stage.name, first), None
                 networks.train()
                 for step in range(first, stage.steps):
                     seed = [config.training.seed, index, step]
+                    chapter = step // (config.training.refresh or stage.steps)
+                    if pools is None or step == chapter * config.training.refresh:
+                        pools = stage.render([config.training.seed, index, chapter])
                     for group in optimizer.param_groups:
                         group["lr"] = learning_rate(step, stage.steps, stage.learning_rate, config.training.schedule)
-                    if batch is None or step % config.training.echo == 0:
-                        batch = stage.batch(np.random.default_rng([*seed[:2], step // config.training.echo]))
-                    losses = stage.losses(batch, _torch_random(seed))
+                    losses = stage.losses(pools, _torch_random(seed), step / stage.steps)
                     loss = torch.stack(list(losses.values())).sum()
                     if not torch.isfinite(loss):
                         raise ReenactError(
@@ -156,100 +186,149 @@ def learning_rate(step: int, steps: int, peak: float, schedule: str) -> float:
     return peak * (1e-4 + (1 - 1e-4) * (1 + math.cos(math.pi * (step - warm) / (steps - warm))) / 2)
 
 
-def _stages(config: Config, studios: dict[str, Studio], networks: Networks) -> list[_Stage]:
-    training, bpnet = config.training, config.bpnet
+def _find_pairs(run: Run, studios: dict[str, Studio], console: Console) -> dict[tuple[str, str], Pairs]:
+    """Pairs between all rigs, both ways; also written to pairs.json, for people to read."""
+    if run.config.pairs.method == "none":
+        return {}
+    pairs, words = {}, {}
+    for source in studios:
+        for target in studios:
+            if source == target:
+                continue
+            found = pairs[source, target] = find_pairs(studios[source], studios[target], run.config.pairs)
+            names = studios[source].rig.names, studios[target].rig.names
+            words[f"{source} -> {target}"] = {
+                names[0][k]: {
+                    "agreed": any(k == pair[0] for pair in found.agreed),
+                    "similarity": round(float(found.similarity[k]), 3),
+                    "shapes": {names[1][j]: round(value, 3) for j, value in enumerate(row) if value > 0.005},
+                }
+                for k, row in enumerate(found.matrix.tolist())
+            }
+            console.print(
+                f"{source} -> {target}: {len(found.agreed)} of {len(names[0])} shapes look like one of the other "
+                "rig's, the rest like mixtures",
+                soft_wrap=True,
+            )
+    write_atomically(run.folder / "pairs.json", (json.dumps(words, indent=1, ensure_ascii=False) + "\n").encode())
+    return pairs
+
+
+def _stages(shop: _Workshop) -> list[_Stage]:
+    training, bpnet = shop.config.training, shop.config.bpnet
     stages = [
         _Stage(
             "reenactnet",
-            networks.reenactnet,
-            _step_count(training.steps, training.epochs, training.fixed_frames, training.batch_size),
+            shop.networks.reenactnet,
+            _step_count(training.steps, training.epochs, training.frames, training.batch_size),
             training.learning_rate,
-            lambda random: {key: _draw(studio, training.batch_size, random) for key, studio in studios.items()},
-            lambda batch, noise: _reenactnet_losses(config, studios, networks, batch, noise),
+            lambda seed: {key: _render(shop, key, seed, list(shop.studios)) for key in shop.studios},
+            lambda pools, random, _done: _reenactnet_losses(shop, pools, random),
         )
     ]
-    for key, studio in studios.items():
+    for key in shop.studios:
+        others = [source for source, target in shop.pairs if target == key]
         stages.append(
             _Stage(
                 f"bpnet.{key}",
-                networks.bpnets[key],
-                _step_count(bpnet.steps, bpnet.epochs, training.fixed_frames, bpnet.batch_size),
+                shop.networks.bpnets[key],
+                _step_count(bpnet.steps, bpnet.epochs, training.frames, bpnet.batch_size),
                 bpnet.learning_rate,
-                lambda random, key=key, studio=studio: {key: _draw(studio, bpnet.batch_size, random)},
-                lambda batch, noise, key=key, studio=studio: _bpnet_losses(
-                    config, studio, networks, key, batch[key], noise
-                ),
+                lambda seed, key=key, others=others: {
+                    key: _render(shop, key, seed, []),
+                    **{other: _render(shop, other, seed, [key], pictured=False) for other in others},
+                },
+                lambda pools, random, done, key=key: _bpnet_losses(shop, key, pools, random, done),
             )
         )
     return stages
 
 
 @torch.no_grad()
-def _draw(studio: Studio, count: int, random: np.random.Generator) -> _Batch:
-    weights = studio.draw(count, random)
-    return _Batch(weights, studio.photograph(weights))
+def _render(shop: _Workshop, key: str, seed: list[int], partners: list[str], pictured: bool = True) -> _Pool:
+    """Fresh expressions of a rig, and how they look on its partners; `pictured` draws them there too."""
+    place = list(shop.studios).index(key)
+    count, elastic = shop.config.training.frames, shop.config.training.elastic
+    weights = shop.studios[key].draw(count, np.random.default_rng([*seed, place]))
+    net, random = shop.networks.reenactnet, _torch_random([*seed, place])
+    described, seen = [], []
+    for chunk in weights.split(_CHUNK):
+        shown = shop.studios[key].show(shop.studios[key].photograph(chunk))
+        described.append(net.describe(key, shown))
+        jittered = net.describe(key, jitter(shown, elastic, random)) if elastic else described[-1]
+        seen.append(net.readable(jittered))
+    found = {}
+    for other in partners:
+        if (key, other) in shop.pairs:
+            pair, pictures = shop.pairs[key, other], []
+            theirs = pair.weights(weights)
+            for chunk in theirs.split(_CHUNK) if pictured else ():
+                pictures.append(net.describe(other, shop.studios[other].show(shop.studios[other].photograph(chunk))))
+            found[other] = _Partners(theirs, torch.cat(pictures) if pictured else None, pair.confidence(weights))
+    return _Pool(weights, torch.cat(described), torch.cat(seen), found)
 
 
-def _reenactnet_losses(
-    config: Config,
-    studios: dict[str, Studio],
-    networks: Networks,
-    batch: dict[str, _Batch],
-    noise: torch.Generator,
-) -> dict[str, Tensor]:
-    """Each rig redraws itself through the shared encoder. Source: KI21, L_recon.
+def _reenactnet_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Generator) -> dict[str, Tensor]:
+    """Each rig redraws itself through the shared encoder, and the other where pairs tell how. Source: KI21, L_recon.
 
-    Ours: residuals against the neutral, jitter of the encoder's input only, weighting by motion, squares.
+    Ours: residuals against the neutral, jitter of the encoder's input only, pairs.
     """
-    training = config.training
-    shown = {key: studio.show(batch[key].pictures) for key, studio in studios.items()}
-    seen = torch.cat([studio.level(shown[key]) for key, studio in studios.items()])
-    if training.elastic:
-        seen = jitter(seen, training.elastic, noise)
-    codes = networks.reenactnet.encode(seen).split(training.batch_size)
-    losses = {}
-    for (key, studio), code in zip(studios.items(), codes):
-        drawn = networks.reenactnet.decoders[key](code)
-        weight = studio.motion if training.motion_weighting else None
-        losses[f"reconstruction.{key}"] = picture_distance(drawn, shown[key], weight, training.loss == "l1+l2")
+    training, net, losses = shop.config.training, shop.networks.reenactnet, {}
+    for key, pool in pools.items():
+        rows = torch.randint(len(pool.weights), (training.batch_size,), generator=random)
+        features = net.encode(pool.seen[rows], key)
+        drawn = net.decoders[key](features)
+        losses[f"reconstruction.{key}"] = net.distances(key, drawn, pool.described[rows]).mean()
+        for other, partners in pool.partners.items():
+            distances = net.distances(other, net.decoders[other](features), partners.described[rows])
+            trust = partners.confidence[rows]
+            losses[f"pairs.{other}"] = training.pair_loss * (distances @ trust) / trust.sum().clamp_min(1e-6)
     return losses
 
 
 def _bpnet_losses(
-    config: Config, studio: Studio, networks: Networks, key: str, batch: _Batch, noise: torch.Generator
+    shop: _Workshop, key: str, pools: dict[str, _Pool], random: torch.Generator, done: float
 ) -> dict[str, Tensor]:
     """Weights are read back from pictures of the rig's own expressions. Source: KI21, L_b = L_w + L_r.
 
-    Ours: part of the pictures passes through ReenactNet first; then all are noisy; errors also count by how far they
-    move the vertices; L_r is taken on part of the pictures.
+    Ours: part of the pictures is drawn by ReenactNet, from the other rig's where there are pairs; errors also count by
+    how far they move the vertices; L_r is taken on part of the pictures.
     """
-    bpnet = config.bpnet
-    order = torch.randperm(len(batch.weights), generator=noise)
-    weights, pictures = batch.weights[order], batch.pictures[order]
-    shown = studio.show(pictures)
-    decoded = round(bpnet.decoded_fraction * len(shown))
-    if decoded:
+    bpnet, net, own = shop.config.bpnet, shop.networks.reenactnet, pools[key]
+    rows = torch.randint(len(own.weights), (bpnet.batch_size,), generator=random)
+    weights, described = own.weights[rows], own.described[rows]
+    read = net.readable(described)
+    count = round(bpnet.decoded_fraction * bpnet.batch_size)
+    sources = [other for other in pools if key in pools[other].partners] or [key]
+    for source, part in zip(sources, torch.arange(count).tensor_split(len(sources))):
+        if not len(part):
+            continue
         with torch.no_grad():
-            seen = jitter(studio.level(shown[:decoded]), config.training.elastic, noise)
-            redrawn = networks.reenactnet(seen, key)
-        shown = torch.cat([redrawn, shown[decoded:]])
-        shown = shown + _PICTURE_NOISE * torch.randn(shown.shape, generator=noise)
-    predicted = networks.bpnets[key](shown)
+            if source == key:
+                drawn = net(own.seen[rows[part]], key, key)
+            else:
+                partners = pools[source].partners[key]
+                chosen = torch.multinomial(partners.confidence, len(part), replacement=True, generator=random)
+                drawn = net(pools[source].seen[chosen], source, key)
+                weights = weights.index_copy(0, part, partners.weights[chosen])
+            read = read.index_copy(0, part, net.readable(drawn))
+    predicted = shop.networks.bpnets[key](read)
     losses = {}
     if bpnet.weight_loss:
         losses["weights"] = bpnet.weight_loss * weight_distance(predicted, weights)
     if bpnet.vertex_loss:
-        losses["vertices"] = bpnet.vertex_loss * studio.vertex_distance(predicted, weights)
-    if bpnet.image_loss:
-        rendered = max(1, round(bpnet.image_fraction * len(predicted)))
-        again = studio.photograph(predicted[-rendered:])  # the last were not decoded, unless all were
-        losses["image"] = bpnet.image_loss * picture_distance(again, pictures[-rendered:])
+        losses["vertices"] = bpnet.vertex_loss * shop.vertex_distances[key](predicted, weights)
+    if bpnet.image_loss and done >= bpnet.image_from:
+        rendered = max(1, round(bpnet.image_fraction * bpnet.batch_size))
+        again = shop.studios[key].show(shop.studios[key].photograph(predicted[-rendered:]))
+        distance = net.distances(key, net.describe(key, again), described[-rendered:]).mean()
+        losses["image"] = bpnet.image_loss * distance  # the last were not drawn, unless all were
     return losses
 
 
-def _step_count(steps: int, epochs: float | None, frames: int | None, batch_size: int) -> int:
+def _step_count(steps: int, epochs: float | None, frames: int, batch_size: int) -> int:
     """Steps, or as many as make the epochs over a fixed set."""
-    if epochs is None or frames is None:
+    if epochs is None:
         return steps
     return math.ceil(epochs * frames / batch_size)
 

@@ -62,9 +62,9 @@ def toy_config(toy_pair, tmp_path_factory) -> Config:
         target=str(folder / "egg.npz"),
         images=ImageConfig(resolution=32),
         layout=LayoutConfig(steps=10, samples=16),
-        reenactnet=ReenactNetConfig(encoder_channels=8, code=16, components=16, decoder_width=32),
-        bpnet=BPNetConfig(channels=8, hidden=32, steps=12, batch_size=4),
-        training=TrainingConfig(steps=12, batch_size=4, save_every=5, threads=1),
+        reenactnet=ReenactNetConfig(code=16, components=16, color_components=8, width=32),
+        bpnet=BPNetConfig(hidden=32, steps=12, batch_size=4),
+        training=TrainingConfig(steps=12, batch_size=4, save_every=5, threads=1, frames=16, refresh=7),
     )
 
 
@@ -105,9 +105,8 @@ def toy_run(toy_config, tmp_path_factory):
 
     run = Run.create(replace(toy_config, run=str(tmp_path_factory.mktemp("runs") / "toy")))
     networks = run.networks()
-    for key in run.keys:
-        studio = run.studio(key)
-        networks.reenactnet.decoders[key].fit(studio.show(studio.survey(20)))
+    studios = {key: run.studio(key) for key in run.keys}
+    networks.fit({key: studio.show(studio.survey(20)) for key, studio in studios.items()})
     tensors = {f"networks.{name}": tensor for name, tensor in networks.state_dict().items()}
     save_checkpoint(run.folder, 1, tensors, {})
     return run

@@ -103,7 +103,7 @@ def test_help_does_not_load_what_takes_seconds_to_load():
 
 def test_settings_come_from_defaults_then_the_file_then_the_command_line(trained, tmp_path):
     (tmp_path / "x.toml").write_text(
-        "source = 'a.glb'\n[training]\nsteps = 7\nbatch_size = 3\n[images]\nresidual = false"
+        "source = 'a.glb'\n[training]\nsteps = 7\nbatch_size = 3\n[images]\nmakeup = false"
     )
     arguments = [
         "train",

@@ -61,7 +61,7 @@ def test_any_text_survives_the_file(name, tmp_path):
 
 @pytest.mark.parametrize("rate", [1e-3, 3e-4, 1e-12, 1 / 3, 12345678.9, 2.0])
 def test_numbers_survive_the_file_to_the_last_bit(rate, tmp_path):
-    config = replace(Config(), training=replace(Config().training, learning_rate=rate, epochs=rate, fixed_frames=7))
+    config = replace(Config(), training=replace(Config().training, learning_rate=rate, epochs=rate, refresh=0))
     save_config(config, tmp_path / "x.toml")
     assert load_config(tmp_path / "x.toml") == config
 
@@ -123,8 +123,11 @@ def test_whole_numbers_may_stand_for_fractions(tmp_path):
         ("[bpnet]\ndecoded_fraction = 1.5", "bpnet.decoded_fraction: expected a number from 0 to 1, got 1.5"),
         ("[bpnet]\nchannels = 12", "bpnet.channels: expected a multiple of 8, got 12"),
         ("[reenactnet]\nkernel = 4", "reenactnet.kernel: expected an odd number from 3 to 15, got 4"),
-        ("[training]\nepochs = 3", "training.epochs: expected training.fixed_frames beside it, got none"),
-        ("[bpnet]\nepochs = 3", "bpnet.epochs: expected training.fixed_frames beside it, got none"),
+        ("[training]\nepochs = 3", "training.epochs: expected training.refresh = 0 beside it, got 2000"),
+        ("[bpnet]\nepochs = 3", "bpnet.epochs: expected training.refresh = 0 beside it, got 2000"),
+        ("[images]\nmotion = false", 'pairs.method: expected images.motion beside "found", got none'),
+        ("[images]\nresidual = false", "images.motion: expected images.residual beside it, got none"),
+        ("[training]\nframes = 7", "training.frames: expected a whole number from 8 to 1,000,000, got 7"),
         ("[bpnet]\nweight_loss = 0\nimage_loss = 0\nvertex_loss = 0", "bpnet: expected a loss above 0"),
         ("source = ''", "source: expected a name or path in Unicode, got ''"),
         ("x =", "expected TOML, got something else"),

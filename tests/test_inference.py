@@ -19,6 +19,14 @@ def test_a_frame_alone_gives_the_weights_that_it_has_in_a_clip(toy_run):
     torch.testing.assert_close(single, moved.weights[60:], rtol=0, atol=1e-5)  # float32, other batch size
 
 
+def test_a_clip_is_what_is_read_from_the_redrawn_pictures(toy_run):
+    retargeter = ImageRetargeter.load(toy_run.folder)
+    weights = torch.rand(9, len(retargeter.source.names), generator=torch.Generator().manual_seed(0))
+    through = retargeter.read(retargeter.reenact(retargeter.source_pictures(weights)))
+    moved = retargeter(Clip(retargeter.source.names, weights, 30.0)).weights
+    torch.testing.assert_close(moved, through, rtol=0, atol=1e-4)  # drawn and described again in float32
+
+
 def test_a_clip_with_other_names_is_refused(toy_run):
     retargeter = ImageRetargeter.load(toy_run.folder)
     with pytest.raises(ReenactError, match="names"):

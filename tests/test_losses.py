@@ -3,13 +3,7 @@
 import pytest
 import torch
 
-from reenact.losses import VertexDistance, motion_weight, picture_distance, weight_distance
-
-
-def test_picture_distance_is_the_weighted_mean_absolute_difference():
-    a, b = torch.zeros(1, 1, 2, 2), torch.tensor([[[[1.0, 0.0], [0.0, -3.0]]]])
-    assert picture_distance(a, b) == pytest.approx(1.0)
-    assert picture_distance(a, b, torch.tensor([[[4.0, 1.0], [1.0, 0.0]]])) == pytest.approx(1.0)
+from reenact.losses import VertexDistance, weight_distance
 
 
 def test_weight_distance_is_the_mean_over_entries():
@@ -32,12 +26,3 @@ def test_vertex_distance_has_a_gradient_where_shapes_are_alike():
     weights = torch.zeros(1, 7, requires_grad=True)
     VertexDistance(rig, torch.rand(4, 7))(weights, torch.eye(7)[:1]).backward()
     assert bool(torch.isfinite(weights.grad).all())
-
-
-def test_motion_weight_is_larger_where_pictures_move_and_bounded():
-    residuals = torch.zeros(3, 3, 4, 4)
-    residuals[:, :, 0, 0] = 1.0
-    weight = motion_weight(residuals)
-    assert weight.shape == (1, 4, 4)
-    assert weight[0, 0, 0] == 4.0
-    assert weight[0, 3, 3] == pytest.approx(0.2)

@@ -84,3 +84,13 @@ def test_makeup_paints_every_rig_alike_but_for_the_eyes():
 
 def test_a_rig_that_does_not_tell_its_lips_keeps_its_colours(toy_rig):
     assert made_up(toy_rig) is toy_rig
+
+
+def test_the_motion_pass_says_how_far_visible_points_moved(toy_rig):
+    portrait = Portrait.of(toy_rig)
+    step = torch.tensor([0.002, -0.001, 0.003])
+    motion = portrait.render((toy_rig.neutral + step)[None], 32, ("mask", "motion"))
+    inside = motion["mask"][0, 0] == 1
+    seen = motion["motion"][0][:, inside]
+    torch.testing.assert_close(seen, (portrait.scale * step)[:, None].expand_as(seen), rtol=1e-4, atol=0)  # float32
+    assert not portrait.render(toy_rig.neutral[None], 32, ("motion",))["motion"].any()

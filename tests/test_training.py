@@ -16,8 +16,12 @@ import torch
 from rich.console import Console
 
 from reenact.checkpoint import load_checkpoint
-from reenact.config import save_config
+from reenact.config import BPNetConfig, PairsConfig, load_config, save_config
 from reenact.errors import ReenactError
+from reenact.evaluation import vertex_error_ratio
+from reenact.inference import ImageRetargeter
+from reenact.rigs.clip import Clip
+from reenact.rigs.motion import expressions
 from reenact.run import Run, networks_state
 from reenact.training import _interrupts, _Log, _preview, _say_next, _step_count, learning_rate, train
 
@@ -130,10 +134,60 @@ def test_a_log_drops_the_lines_of_steps_that_are_taken_again(tmp_path):
 
 
 def test_epochs_over_a_fixed_set_become_steps():
-    assert _step_count(7, None, None, 4) == 7
     assert _step_count(7, None, 10, 4) == 7
     assert _step_count(7, 2.0, 10, 4) == 5
     assert _step_count(7, 1.0, 10, 4) == 3
+
+
+@pytest.mark.parametrize("network", ["components", "convolutional"])
+@pytest.mark.parametrize("pairs", ["found", "none"])
+def test_every_kind_of_network_trains_with_and_without_pairs(network, pairs, toy_config, tmp_path):
+    config = replace(
+        toy_config,
+        run=str(tmp_path / "run"),
+        pairs=PairsConfig(method=pairs),
+        reenactnet=replace(toy_config.reenactnet, network=network, encoder_channels=8, seed_channels=8),
+        bpnet=replace(toy_config.bpnet, channels=8),
+        training=replace(toy_config.training, elastic=0.02),
+    )
+    train(config)
+    stages = {line["stage"]: line for line in _losses(tmp_path / "run")}
+    assert {f"pairs.{key}" in stages["reenactnet"] for key in ("ball", "egg")} == {pairs == "found"}
+    assert (tmp_path / "run" / "pairs.json").exists() == (pairs == "found")
+    assert {"weights", "vertices", "image"} <= stages["bpnet.egg"].keys()
+
+
+def test_the_published_settings_train(toy_config, tmp_path):
+    paper = load_config(Path(__file__).parents[1] / "configs" / "paper-kim2021.toml")
+    small = replace(
+        paper,
+        source=toy_config.source,
+        target=toy_config.target,
+        run=str(tmp_path / "run"),
+        images=replace(paper.images, resolution=32),
+        reenactnet=replace(paper.reenactnet, encoder_channels=8, seed_channels=8, decoder_channels=8, code=16),
+        bpnet=replace(paper.bpnet, channels=8, epochs=1.0),
+        training=replace(paper.training, frames=16, epochs=1.0, batch_size=8),
+    )
+    train(small)
+    assert {line["step"] for line in _losses(tmp_path / "run")} == {2, 4}  # 16 / 8, 16 / 5 rounded up
+
+
+@pytest.mark.parametrize("pairs", ["found", "none"])
+def test_what_is_learnt_moves_the_other_rig_without_being_told_how(pairs, toy_config, tmp_path):
+    """The toys carry the same shapes, so copied weights are the truth; training never sees names."""
+    config = replace(
+        toy_config,
+        run=str(tmp_path / "run"),
+        pairs=PairsConfig(method=pairs),
+        bpnet=BPNetConfig(hidden=64, steps=400, batch_size=32, image_from=0.99),
+        training=replace(toy_config.training, steps=400, batch_size=32, frames=512, refresh=0),
+    )
+    folder = train(config)
+    retargeter = ImageRetargeter.load(folder)
+    weights = expressions(retargeter.source.names, 64, 12345)
+    moved = retargeter(Clip(retargeter.source.names, weights, 30.0)).weights
+    assert vertex_error_ratio(retargeter.target, moved, weights) < 0.25  # 1 is a face that stays still
 
 
 def test_a_preview_that_fails_does_not_stop_the_training(toy_run, tmp_path):

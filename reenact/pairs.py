@@ -1,0 +1,86 @@
+"""Which shapes of two rigs do the same, found by what they look like.
+
+Ours; the image-based twin of the pseudo-pairs that geometric methods give. In the shared layout, the motion pass of a
+single shape is nearly its fingerprint: a blink moves the lid down on any face. Two shapes are a pair if each is the
+other's best match, and clearly so: what only one side claims is not believed. Nothing here sees names, mesh topology or
+paired expressions. A shape at full strength is taken to mean its partner at full strength, whatever the distance that
+either moves (the "range of motion" of Ribera et al. 2017); shapes without a partner become the mixture of the other
+rig's shapes that comes closest, amplitudes and all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from scipy.optimize import lsq_linear
+from torch import Tensor
+
+from reenact.config import PairsConfig
+from reenact.data import Studio
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The shapes of a source in terms of a target's."""
+
+    matrix: Float[Tensor, "Ks Kt"]
+    """Weights of the target that look like each shape of the source at 1."""
+    similarity: Float[Tensor, "Ks"]
+    """Correlation of that look with the shape's own, in [0, 1]."""
+    agreed: tuple[tuple[int, int], ...]
+    """The pairs that both rigs agree on: source shape, target shape."""
+    strength: Float[Tensor, "Ks"]
+    """How much each source shape moves, root of the summed squares of its motion pass."""
+
+    def weights(self, source_weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"]:
+        """Weights of the target for expressions of the source, in [0, 1]."""
+        return (source_weights @ self.matrix).clamp(0, 1)
+
+    def confidence(self, source_weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N"]:
+        """How far to believe the weights of each expression: mean squared similarity of its shapes, by their motion."""
+        moved = source_weights * self.strength
+        return (moved @ self.similarity.square()) / moved.sum(1).clamp_min(1e-12)
+
+
+@torch.no_grad()
+def find_pairs(source: Studio, target: Studio, config: PairsConfig) -> Pairs:
+    """The target's counterpart of each shape of the source.
+
+    Args:
+        source: Studio of the rig that motion comes from, with a motion pass.
+        target: Studio of the rig that it goes to, in the same layout.
+        config: When two shapes count as one.
+    """
+    ours, theirs = (studio.glance(torch.eye(len(studio.rig.names))).flatten(1) for studio in (source, target))
+    strength = ours.norm(dim=1)
+    correlation = _unit(ours) @ _unit(theirs).T  # (Ks, Kt)
+    agreed = _agreed(correlation, config)
+    matrix, similarity = torch.zeros_like(correlation), torch.zeros(len(ours))
+    for k, j in agreed:
+        matrix[k, j], similarity[k] = 1.0, correlation[k, j]
+    basis, triangle = torch.linalg.qr(theirs.double().T)  # (P, Kt), (Kt, Kt)
+    wanted = ours.double() @ basis
+    for k in set(range(len(ours))) - {k for k, _ in agreed}:
+        mixture = lsq_linear(triangle.numpy(), wanted[k].numpy(), bounds=(0, 1)).x
+        matrix[k] = torch.from_numpy(mixture).float()
+        similarity[k] = (_unit(ours[k : k + 1]) @ _unit((matrix[k] @ theirs)[None]).T).clamp_min(0)
+    return Pairs(matrix, similarity, agreed, strength)
+
+
+def _agreed(correlation: Tensor, config: PairsConfig) -> tuple[tuple[int, int], ...]:
+    """Pairs that are each other's best, similar enough, and better than each one's next best by the margin."""
+    best = correlation.argmax(1)
+    pairs = []
+    for k, j in enumerate(best.tolist()):
+        found = correlation[k, j]
+        row, column = correlation[k].clone(), correlation[:, j].clone()
+        row[j], column[k] = -1.0, -1.0
+        if found >= config.similarity and found - torch.maximum(row.max(), column.max()) >= config.margin:
+            pairs.append((k, j))
+    return tuple(pairs)
+
+
+def _unit(rows: Tensor) -> Tensor:
+    return rows / rows.norm(dim=1, keepdim=True).clamp_min(1e-9)
