@@ -10,7 +10,7 @@ from torch import Tensor
 
 from reenact.config import ImageConfig
 from reenact.errors import ReenactError
-from reenact.portrait import Portrait, made_up
+from reenact.portrait import BACKGROUND, Portrait, made_up
 from reenact.rigs import motion
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
@@ -89,8 +89,9 @@ class Studio:
         buffers = buffers or self.buffers
         rendered = self.portrait.render(self.rig.vertices(weights), self.rendered_at, buffers)
         picture = torch.cat([rendered[name] for name in buffers], dim=1)
-        if self.layout is not None:
-            picture = warp(picture, self.layout)
+        if self.layout is not None:  # beyond the picture lies background, which only colours have
+            beyond = torch.cat([_beyond(name, rendered[name].shape[1]) for name in buffers])[:, None, None]
+            picture = warp(picture - beyond, self.layout, "zeros") + beyond
         return F.adaptive_avg_pool2d(picture, self.resolution)
 
     def glance(self, weights: Float[Tensor, "N K"]) -> Float[Tensor, "N 3 R R"]:
@@ -114,10 +115,19 @@ class Studio:
         return torch.cat([pictures[:, :3].clamp(0, 1), pictures[:, 3:]], dim=1)
 
 
-def warp(pictures: Float[Tensor, "N C H W"], grid: Float[Tensor, "H W 2"]) -> Float[Tensor, "N C H W"]:
-    """Pictures resampled at the grid's positions, (x, y) in [-1, 1] with -1 the outer edge of the first pixel."""
+def _beyond(buffer: str, channels: int) -> Float[Tensor, "C"]:
+    return torch.tensor(BACKGROUND) if buffer == "color" else torch.zeros(channels)
+
+
+def warp(
+    pictures: Float[Tensor, "N C H W"], grid: Float[Tensor, "H W 2"], beyond: str = "border"
+) -> Float[Tensor, "N C H W"]:
+    """Pictures resampled at the grid's positions, (x, y) in [-1, 1] with -1 the outer edge of the first pixel.
+
+    `beyond` the picture lies its "border" for ever, or "zeros".
+    """
     return F.grid_sample(
-        pictures, grid.expand(len(pictures), -1, -1, -1), mode="bilinear", padding_mode="border", align_corners=False
+        pictures, grid.expand(len(pictures), -1, -1, -1), mode="bilinear", padding_mode=beyond, align_corners=False
     )
 
 

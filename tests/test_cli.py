@@ -116,7 +116,7 @@ def test_settings_come_from_defaults_then_the_file_then_the_command_line(trained
     ]
     assert main(arguments) == 0
     training = replace(Config().training, steps=9, batch_size=3, learning_rate=1e-4)
-    expected = replace(Config(), source="a.glb", training=training, images=replace(Config().images, residual=False))
+    expected = replace(Config(), source="a.glb", training=training, images=replace(Config().images, makeup=False))
     assert trained == [(expected, False)]
 
 

@@ -9,6 +9,7 @@ import torch
 from reenact.config import ImageConfig
 from reenact.data import Studio, identity_grid
 from reenact.errors import ReenactError
+from reenact.portrait import BACKGROUND
 from reenact.rigs.clip import Clip
 
 SMALL = ImageConfig(resolution=16)
@@ -65,6 +66,14 @@ def test_a_layout_of_any_resolution_moves_the_pictures(toy_rig, studio):
     step = torch.tensor([2 / 16, 0.0])  # one pixel to the right in the rig's own picture
     moved = Studio(toy_rig, SMALL, layout=identity_grid(32) + step).photograph(weights)
     torch.testing.assert_close(moved[..., :-1], still[..., 1:], rtol=0, atol=1e-5)
+
+
+def test_beyond_the_picture_lies_background(toy_rig):
+    far = identity_grid(16) + torch.tensor([1.0, 0.0])  # the right half looks past the border
+    pictures = Studio(toy_rig, SMALL, layout=far).photograph(torch.ones(1, len(toy_rig.names)))
+    colors, motion = pictures[0, :3, :, 9:], pictures[0, 3:, :, 9:]
+    torch.testing.assert_close(colors, torch.tensor(BACKGROUND)[:, None, None].expand_as(colors))
+    assert not motion.any()
 
 
 def test_buffers_are_stacked_and_weights_have_a_gradient(studio):
