@@ -277,9 +277,11 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
     from rich.table import Table
 
     columns = {"retargeted": numbers, "direct": numbers["direct"]}
+    columns |= {"pairs": numbers["paired"]} if numbers["paired"] else {}
     columns |= {name.replace("_", " "): row for name, row in numbers["baselines"].items()}
     title = f"{numbers['run']}: {numbers['source']} -> {numbers['target']}, {numbers['frames']} unseen frames"
-    compared = Table(title=title, title_justify="left", caption="direct: without ReenactNet", caption_justify="left")
+    caption = "direct: without ReenactNet" + "; pairs: of shapes, without any network" * bool(numbers["paired"])
+    compared = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     compared.add_column("", no_wrap=True)
     for name in columns:
         compared.add_column(name, justify="right")

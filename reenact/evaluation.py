@@ -64,6 +64,7 @@ class PictureRetargeter(Protocol):
     def reenact(self, pictures: Tensor) -> Tensor: ...
     def read(self, pictures: Tensor) -> Tensor: ...
     def read_direct(self, pictures: Tensor) -> Tensor: ...
+    def paired(self, weights: Tensor) -> Tensor | None: ...
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -490,6 +491,8 @@ def evaluate_retargeters(
           order), each with `truth` and `cyclic`.
         - `direct`: the ablation that feeds the source's residual picture straight to the target's BPNet. ReenactNet
           earns its place by beating it.
+        - `paired`: the pairs of shapes that training found, applied to the weights without any network; None without
+          pairs. Zero where every shape of one rig has its partner on the other: read `truth` beside it.
         - `kinds`: `truth` and `cyclic` per kind of clip. `shapes`: `per_shape` by name. `worst`: frames by falling
           vertex error.
 
@@ -512,6 +515,7 @@ def evaluate_retargeters(
     cycle = _PictureComparison(forward.source_pictures, forward.source_masks, weights)
     direct = _in_chunks(forward.read_direct, cycle.pictures)
     direct_back = _in_chunks(lambda part: reverse.read_direct(reverse.source_pictures(part)), direct)
+    paired = forward.paired(weights)
     order = torch.randperm(len(weights), generator=torch.Generator().manual_seed(seed))
 
     say("comparing pictures of the cycle")
@@ -521,6 +525,8 @@ def evaluate_retargeters(
         "neutral": torch.zeros_like(weights),
         "mean_pose": weights.mean(0).expand_as(weights),
     }
+    if paired is not None:
+        returned["paired"] = reverse.paired(paired)
     cycle.against(returned).against_pictures("shuffled", cycle.pictures[order])
     returned["shuffled"] = weights[order]
     cyclic = {
@@ -539,6 +545,8 @@ def evaluate_retargeters(
             pictures = _in_chunks(forward.source_pictures, known)
             answers["reenact"] = _retarget(forward, _split(source.names, known, kinds, fps))
             answers["direct"] = _in_chunks(forward.read_direct, pictures)
+        if paired is not None:
+            answers["paired"] = forward.paired(known)
         answers |= {
             "neutral": torch.zeros_like(truth),
             "mean_pose": truth.mean(0).expand_as(truth),
@@ -591,6 +599,7 @@ def evaluate_retargeters(
         "speed": speed,
         "baselines": {name: summary(name, "all") for name in ("neutral", "mean_pose", "shuffled")},
         "direct": summary("direct", "all"),
+        "paired": None if paired is None else summary("paired", "all"),
         "kinds": {kind: summary("reenact", kind) for kind in kinds},
         "shapes": shapes,
         "worst": worst,

@@ -16,6 +16,7 @@ from reenact.config import Config
 from reenact.data import Studio
 from reenact.errors import ReenactError
 from reenact.models import Networks
+from reenact.pairs import find_pairs
 from reenact.rigs.clip import Clip
 from reenact.run import Run
 
@@ -100,3 +101,13 @@ class ImageRetargeter:
     def read_direct(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N Kt"]:
         """Weights read from the source's own pictures by the target's BPNet: what ReenactNet has to beat."""
         return self.networks.read(self.source_studio.show(pictures), self.keys[1]).clamp(0, 1)
+
+    @torch.inference_mode()
+    def paired(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"] | None:
+        """The target's weights by the pairs of shapes that training learnt from, without any network; None if none.
+
+        Where every shape has its partner this is copying by look, and better than any network that learns from it.
+        """
+        if self.config.pairs.method == "none":
+            return None
+        return find_pairs(self.source_studio, self.target_studio, self.config.pairs).weights(weights)

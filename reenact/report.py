@@ -126,6 +126,12 @@ def verdict(result: dict[str, Any]) -> str:
             f"Without ReenactNet in between it is {direct:.2f}"
             + (", so ReenactNet earns its place. " if ver < direct else ", so ReenactNet does not help here. ")
         )
+    paired = ((result.get("paired") or {}).get("truth") or {}).get("ver")
+    if paired is not None:
+        parts.append(
+            f"The pairs of shapes that training found reach {paired:.2f} without any network"
+            + (": on these rigs, copying by look is better. " if paired < ver else ". ")
+        )
     floor = result["bpnet"]["ver"]
     if floor is not None:
         parts.append(f"BPNet reads true pictures of the target at {floor:.2f}")
@@ -240,6 +246,7 @@ def _methods(result: dict[str, Any]) -> list[dict[str, Any]]:
     rows = [
         ("this run", {"truth": result.get("truth"), "cyclic": result["cyclic"]}),
         ("without ReenactNet", result["direct"]),
+        *([("pairs of shapes alone, no network", result["paired"])] if result.get("paired") else []),
         *((_BASELINES[name], result["baselines"][name]) for name in _BASELINES),
     ]
     return [{"title": title, "width": _width(row["truth"]), **row} for title, row in rows]

@@ -70,6 +70,9 @@ class FakeRetargeter:
     def read_direct(self, pictures):
         return 0.5 * self.rule(self._read(self.source, pictures))
 
+    def paired(self, weights):
+        return 0.75 * self.rule(weights)
+
 
 def copy(weights):
     return weights.clone()
@@ -406,6 +409,12 @@ def test_half_the_motion_is_half_the_error_and_the_direct_ablation_is_reported(p
     assert numbers["direct"]["truth"]["ver"] == pytest.approx(0.5, abs=1e-3)  # the fake halves; pseudo-inverse
     assert numbers["direct"]["truth"]["gain"] == pytest.approx(0.5, abs=1e-3)
     assert numbers["direct"]["cyclic"]["ver"] == pytest.approx(0.75, abs=1e-3)  # halved there and back
+
+
+def test_pairs_alone_are_reported_where_there_are_pairs(perfect, rigs):
+    numbers, _ = perfect
+    assert numbers["paired"]["truth"]["ver"] == pytest.approx(0.25, abs=1e-3)  # the fake takes three quarters
+    assert numbers["paired"]["cyclic"]["ver"] == pytest.approx(1 - 0.75**2, abs=1e-3)
 
 
 def test_a_constant_pose_beats_the_neutral_nowhere_in_correlation(perfect):

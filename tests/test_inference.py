@@ -70,3 +70,8 @@ def test_a_clip_of_a_few_frames_goes_all_the_way(suffix, toy_run, tmp_path, caps
     assert main(["infer", f"{toy_run.folder}", "synthetic:0:0.2", "--out", f"{out}", "--reverse"]) == 0
     assert capsys.readouterr() == (f"{out}: 6 frames, 0.2 s, egg -> ball\n", "")
     assert len(load_clip(f"{out}", toy_run.rigs["ball"])) == 6
+
+
+def test_pairs_alone_copy_between_rigs_whose_shapes_look_alike(toy_run):
+    weights = torch.rand(3, 7, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(ImageRetargeter.load(toy_run.folder).paired(weights), weights)

@@ -69,6 +69,9 @@ class Halved:
 
     read_direct = read
 
+    def paired(self, weights):
+        return None
+
 
 def make_run(folder, source, target, frames=36):
     """An evaluated run folder and its numbers."""
@@ -196,7 +199,7 @@ def test_rigs_without_shared_names_are_judged_by_pictures_alone(tmp_path):
     assert Links(page).open == []
 
 
-def make_result(ver=0.2, direct=0.4, bpnet=0.05, gain=1.0):
+def make_result(ver=0.2, direct=0.4, bpnet=0.05, gain=1.0, paired=None):
     def part(value):
         return {"truth": {"ver": value}, "cyclic": {"skill": 0.5}}
 
@@ -208,6 +211,7 @@ def make_result(ver=0.2, direct=0.4, bpnet=0.05, gain=1.0):
         "truth": truth,
         "cyclic": {"skill": 0.5},
         "direct": part(direct),
+        "paired": part(paired) if paired is not None else None,
         "bpnet": {"ver": bpnet},
         "baselines": {"neutral": part(1.0), "mean_pose": part(0.9), "shuffled": part(1.3)},
         "kinds": {"speech": part(0.1), "blinks": part(0.6)},
@@ -233,6 +237,12 @@ def test_the_verdict_does_not_flatter():
     assert "reading weights from pictures is a large part" in bad
     assert "Shapes move too little (gain 0.50)" in bad
     assert "Shapes move too far" in report.verdict(make_result(gain=1.5))
+
+
+def test_the_verdict_says_when_pairs_alone_do_better():
+    assert "pairs" not in report.verdict(make_result())
+    assert "copying by look is better" in report.verdict(make_result(paired=0.0))
+    assert "reach 0.50 without any network. " in report.verdict(make_result(paired=0.5))
 
 
 def test_a_sprite_sheet_holds_its_pictures_row_by_row():
