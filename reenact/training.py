@@ -36,8 +36,8 @@ from reenact.pairs import Pairs, find_pairs
 from reenact.preview import save_preview
 from reenact.run import Run, restore_networks
 
-_SURVEYED = 2048
-"""Pictures of each rig from which networks learn what varies, before any training."""
+_PICTURES_PER_COMPONENT = 8
+"""Pictures of each rig, per principal component, from which networks learn what varies before any training."""
 _CHUNK = 64
 """Expressions that are photographed at once; part of what makes a run repeatable."""
 _LOG_EVERY = 20
@@ -124,8 +124,9 @@ def train(config: Config, resume: bool = False) -> Path:
         stages = _stages(_Workshop(config, studios, networks, pairs, distances))
         stage_index, first, optimizer = _restore(run, networks, stages) if resume else (0, 0, None)
         if (stage_index, first) == (0, 0):
+            count = _PICTURES_PER_COMPONENT * config.reenactnet.components
             with console.status("Finding what varies in each rig's pictures"):
-                networks.fit({key: studio.show(studio.survey(_SURVEYED)) for key, studio in studios.items()})
+                networks.fit({key: studio.show(studio.survey(count)) for key, studio in studios.items()})
         done = sum(stage.steps for stage in stages[:stage_index])
         with _progress(console) as show:
             for index, stage in list(enumerate(stages))[stage_index:]:

@@ -45,14 +45,15 @@ def _losses(folder: Path) -> list[dict]:
     return [{key: value for key, value in line.items() if key != "steps_per_second"} for line in lines]
 
 
-def test_a_run_killed_at_any_moment_resumes_to_the_same_weights(toy_config, finished, tmp_path):
+@pytest.mark.parametrize("saved", [5, 10, 22])  # before and after fresh expressions; in the second stage
+def test_a_run_killed_at_any_moment_resumes_to_the_same_weights(saved, toy_config, finished, tmp_path):
     folder = tmp_path / "killed"
     config_file = tmp_path / "config.toml"
     save_config(replace(toy_config, run=str(folder)), config_file)
     command = [sys.executable, "-m", "reenact.cli", "train", "--config", str(config_file)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=os.environ)
     deadline = time.monotonic() + 120
-    while not list(folder.glob("checkpoints/*.safetensors")) and process.poll() is None:
+    while not any(f"{saved:06d}" in path.name for path in folder.glob("checkpoints/*")) and process.poll() is None:
         assert time.monotonic() < deadline
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
@@ -181,7 +182,7 @@ def test_what_is_learnt_moves_the_other_rig_without_being_told_how(pairs, toy_co
         run=str(tmp_path / "run"),
         pairs=PairsConfig(method=pairs),
         bpnet=BPNetConfig(hidden=64, steps=400, batch_size=32, image_from=0.99),
-        training=replace(toy_config.training, steps=400, batch_size=32, frames=512, refresh=0),
+        training=replace(toy_config.training, steps=400, batch_size=32, frames=512, refresh=0, save_every=1000),
     )
     folder = train(config)
     retargeter = ImageRetargeter.load(folder)
