@@ -110,7 +110,7 @@ class ComponentReenactNet(nn.Module):
     """One shared encoder and one linear decoder per rig, from principal components to principal components. Ours.
 
     A motion pass is nearly linear in the weights, which a convolutional network has to discover and this one is built
-    for: straight maps beside every dense layer. A step costs a hundredth. All that is nonlinear stays in the part that
+    for: straight maps beside every dense layer. A picture costs a tenth. All that is nonlinear stays in the part that
     the rigs share, which keeps their codes together.
     """
 

@@ -137,6 +137,7 @@ def train(config: Config, resume: bool = False) -> Path:
                     seed = [config.training.seed, index, step]
                     chapter = step // (config.training.refresh or stage.steps)
                     if pools is None or step == chapter * config.training.refresh:
+                        console.print(f"{stage.name}: rendering {config.training.frames:,} fresh expressions per rig")
                         pools = stage.render([config.training.seed, index, chapter])
                     for group in optimizer.param_groups:
                         group["lr"] = learning_rate(step, stage.steps, stage.learning_rate, config.training.schedule)
@@ -252,12 +253,14 @@ def _render(shop: _Workshop, key: str, seed: list[int], partners: list[str], pic
     count, elastic = shop.config.training.frames, shop.config.training.elastic
     weights = shop.studios[key].draw(count, np.random.default_rng([*seed, place]))
     net, random = shop.networks.reenactnet, _torch_random([*seed, place])
-    described, seen = [], []
+    parts, bent = [], []
     for chunk in weights.split(_CHUNK):
         shown = shop.studios[key].show(shop.studios[key].photograph(chunk))
-        described.append(net.describe(key, shown))
-        jittered = net.describe(key, jitter(shown, elastic, random)) if elastic else described[-1]
-        seen.append(net.readable(jittered))
+        parts.append(net.describe(key, shown))
+        if elastic:
+            bent.append(net.readable(net.describe(key, jitter(shown, elastic, random))))
+    described = torch.cat(parts)
+    seen = torch.cat(bent) if elastic else net.readable(described)
     found = {}
     for other in partners:
         if (key, other) in shop.pairs:
@@ -265,8 +268,9 @@ def _render(shop: _Workshop, key: str, seed: list[int], partners: list[str], pic
             theirs = pair.weights(weights)
             for chunk in theirs.split(_CHUNK) if pictured else ():
                 pictures.append(net.describe(other, shop.studios[other].show(shop.studios[other].photograph(chunk))))
-            found[other] = _Partners(theirs, torch.cat(pictures) if pictured else None, pair.confidence(weights))
-    return _Pool(weights, torch.cat(described), torch.cat(seen), found)
+            trust = pair.confidence(weights) + 1e-6  # rigs that have nothing in common still train
+            found[other] = _Partners(theirs, torch.cat(pictures) if pictured else None, trust)
+    return _Pool(weights, described, seen, found)
 
 
 def _reenactnet_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Generator) -> dict[str, Tensor]:
@@ -283,7 +287,7 @@ def _reenactnet_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.G
         for other, partners in pool.partners.items():
             distances = net.distances(other, net.decoders[other](features), partners.described[rows])
             trust = partners.confidence[rows]
-            losses[f"pairs.{other}"] = training.pair_loss * (distances @ trust) / trust.sum().clamp_min(1e-6)
+            losses[f"pairs.{other}"] = training.pair_loss * (distances @ trust) / trust.sum()
     return losses
 
 
@@ -319,11 +323,12 @@ def _bpnet_losses(
         losses["weights"] = bpnet.weight_loss * weight_distance(predicted, weights)
     if bpnet.vertex_loss:
         losses["vertices"] = bpnet.vertex_loss * shop.vertex_distances[key](predicted, weights)
-    if bpnet.image_loss and done >= bpnet.image_from:
-        rendered = max(1, round(bpnet.image_fraction * bpnet.batch_size))
+    others = 0 if sources == [key] else count  # the first pictures are then of expressions that were not rendered
+    rendered = min(max(1, round(bpnet.image_fraction * bpnet.batch_size)), bpnet.batch_size - others)
+    if bpnet.image_loss and done >= bpnet.image_from and rendered:
         again = shop.studios[key].show(shop.studios[key].photograph(predicted[-rendered:]))
         distance = net.distances(key, net.describe(key, again), described[-rendered:]).mean()
-        losses["image"] = bpnet.image_loss * distance  # the last were not drawn, unless all were
+        losses["image"] = bpnet.image_loss * distance
     return losses
 
 

@@ -20,6 +20,7 @@ from reenact.config import BPNetConfig, PairsConfig, load_config, save_config
 from reenact.errors import ReenactError
 from reenact.evaluation import vertex_error_ratio
 from reenact.inference import ImageRetargeter
+from reenact.pairs import Pairs
 from reenact.rigs.clip import Clip
 from reenact.rigs.motion import expressions
 from reenact.run import Run, networks_state
@@ -156,6 +157,19 @@ def test_every_kind_of_network_trains_with_and_without_pairs(network, pairs, toy
     assert {f"pairs.{key}" in stages["reenactnet"] for key in ("ball", "egg")} == {pairs == "found"}
     assert (tmp_path / "run" / "pairs.json").exists() == (pairs == "found")
     assert {"weights", "vertices", "image"} <= stages["bpnet.egg"].keys()
+
+
+def test_the_loss_through_the_renderer_is_left_out_where_no_picture_of_its_own_is_left(toy_config, tmp_path):
+    bpnet = replace(toy_config.bpnet, decoded_fraction=1.0)  # all drawn from the other rig's expressions
+    train(replace(toy_config, run=str(tmp_path / "run"), bpnet=bpnet))
+    assert not any("image" in line for line in _losses(tmp_path / "run"))
+
+
+def test_rigs_with_nothing_in_common_still_train(toy_config, tmp_path, monkeypatch):
+    nothing = Pairs(torch.zeros(7, 7), torch.zeros(7), (), torch.ones(7))
+    monkeypatch.setattr("reenact.training.find_pairs", lambda source, target, config: nothing)
+    train(replace(toy_config, run=str(tmp_path / "run")))
+    assert {line["stage"] for line in _losses(tmp_path / "run")} == {"reenactnet", "bpnet.ball", "bpnet.egg"}
 
 
 def test_the_published_settings_train(toy_config, tmp_path):
