@@ -151,6 +151,8 @@ class TrainingConfig:
     Helps where no pairs teach it to overlook how faces differ."""
     motion_weighting: bool = True
     """Convolutional: weight the reconstruction by where each rig's pictures move."""
+    crowded: float = 0.0
+    """Share of random expressions that move any number of shapes, up to all, more weakly, as recorded faces do."""
     frames: int = 8192
     """Rendered expressions of each rig that are in memory at a time."""
     refresh: int = 2000
@@ -310,6 +312,7 @@ _ALLOWED: dict[str, _Rule] = {
     "training.weight_decay": _NOT_NEGATIVE,
     "training.elastic": _FRACTION,
     "training.pair_loss": _NOT_NEGATIVE,
+    "training.crowded": _FRACTION,
     "training.frames": ("a whole number from 8 to 1,000,000", lambda value: 8 <= value <= 1_000_000),
     "training.refresh": ("a whole number of at least 0", lambda value: value >= 0),
     "training.seed": ("a whole number from 0 to 2^63 - 1", lambda value: 0 <= value < 2**63),

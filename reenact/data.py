@@ -34,6 +34,7 @@ class Studio:
         layout: Float[Tensor, "R R 2"] | None = None,
         clip: Clip | None = None,
         seed: int = 0,
+        crowded: float = 0.0,
     ):
         """
         Args:
@@ -44,11 +45,12 @@ class Studio:
                 None leaves it.
             clip: Training motion with the rig's names; None samples random valid expressions without end.
             seed: Of the survey.
+            crowded: Share of random expressions that move any number of shapes; see `motion.expressions`.
 
         Raises:
             ReenactError: The rig has no eyes above a mouth, or its pictures do not change.
         """
-        self.seed = seed
+        self.seed, self.crowded = seed, crowded
         self.rig, self.resolution, self.residual = rig, config.resolution, config.residual
         self.buffers = ("color", "motion") if config.motion else ("color",)
         self.rendered_at = config.supersample * config.resolution
@@ -70,7 +72,7 @@ class Studio:
     def draw(self, count: int, random: np.random.Generator) -> Float[Tensor, "N K"]:
         """Weights of training expressions: from the clip if there is one, else fresh."""
         if self.pool is None:
-            return motion.expressions(self.rig.names, count, random)
+            return motion.expressions(self.rig.names, count, random, self.crowded)
         return self.pool[random.integers(len(self.pool), size=count)]
 
     @torch.no_grad()

@@ -123,6 +123,7 @@ class Run:
             self.layouts.get(key),
             clip,
             seed=1000 * config.training.seed + index,
+            crowded=config.training.crowded,
         )
 
     def networks(self) -> Networks:

@@ -194,3 +194,12 @@ BAD = {
 def test_a_clip_that_cannot_be_made_is_refused(change, message):
     with pytest.raises(ReenactError, match=message):
         motion.synthesize(**({"names": arkit.NAMES, "seconds": 1.0, "seed": 0} | change))
+
+
+def test_crowded_expressions_move_many_shapes_and_stay_valid():
+    sparse, dense = (motion.expressions(arkit.NAMES, 500, 3, crowded) for crowded in (0.0, 1.0))
+    assert torch.equal(sparse, motion.expressions(arkit.NAMES, 500, 3))
+    assert (dense > 0.02).sum(1).float().mean() > 3 * (sparse > 0.02).sum(1).float().mean()
+    assert dense.max() <= 1
+    product = dense[:, arkit.NAMES.index("jawLeft")] * dense[:, arkit.NAMES.index("jawRight")]
+    assert product.max() <= motion.BOTH + 1e-6  # float32

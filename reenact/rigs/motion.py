@@ -30,7 +30,9 @@ BOTH = 0.1
 """Two shapes that exclude each other keep the product of their weights below this."""
 
 
-def expressions(names: Sequence[str], count: int, seed: int | Generator) -> Float[Tensor, "{count} K"]:
+def expressions(
+    names: Sequence[str], count: int, seed: int | Generator, crowded: float = 0.0
+) -> Float[Tensor, "{count} K"]:
     """Random valid expressions: weights in [0, 1], most of them 0.
 
     An expression has 1 + Poisson(2) active units, a unit being a shape or a left/right pair; amplitudes are
@@ -44,6 +46,8 @@ def expressions(names: Sequence[str], count: int, seed: int | Generator) -> Floa
         names: Shapes to sample, K of them.
         count: Expressions.
         seed: A seed, or a generator that is advanced.
+        crowded: Share of expressions in which any number of units are active, up to all of them, at a common strength
+            from 0.2 to 1 of the usual. Recorded faces are like that: they move nearly every shape a little.
     """
     table = _table(tuple(names))
     rng = np.random.default_rng(seed)
@@ -51,11 +55,16 @@ def expressions(names: Sequence[str], count: int, seed: int | Generator) -> Floa
     # The smallest of exponential waiting times are a weighted draw without replacement.
     waits = rng.standard_exponential((count, groups), dtype=np.float32) / table.frequency
     active = np.minimum(1 + rng.poisson(2.0, count), groups)
+    strength = np.ones(count)
+    if crowded:
+        full = rng.random(count) < crowded
+        active[full] = rng.integers(1, groups, count, endpoint=True)[full]
+        strength[full] = rng.uniform(0.2, 1.0, count)[full]
     last = np.take_along_axis(np.sort(waits, axis=1), active[:, None] - 1, axis=1)  # (N, 1)
     amplitude_normal = rng.standard_normal((2, count, groups), dtype=np.float32)
     amplitude_normal[1] = 0.91 * amplitude_normal[0] + 0.4146 * amplitude_normal[1]  # correlation 0.91, variance 1
     amplitudes = np.interp(ndtr(amplitude_normal), _QUANTILES, _BETA)
-    amplitudes *= waits <= last
+    amplitudes *= (waits <= last) * strength[:, None]
     alone = rng.random((count, groups), dtype=np.float32)
     alone[:, table.together] = 1
     amplitudes[0] *= ~((alone >= 0.15) & (alone < 0.3))
