@@ -276,7 +276,7 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
     """What one evaluation found, for the terminal."""
     from rich.table import Table
 
-    columns = {"retargeted": numbers, "direct": numbers["direct"]}
+    columns = {"this run": numbers, "direct": numbers["direct"]}
     columns |= {"pairs": numbers["paired"]} if numbers["paired"] else {}
     columns |= {name.replace("_", " "): row for name, row in numbers["baselines"].items()}
     title = f"{numbers['run']}: {numbers['source']} -> {numbers['target']}, {numbers['frames']} unseen frames"
