@@ -6,6 +6,7 @@ section 3: render the source, redraw it as the target with ReenactNet, read the 
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -16,7 +17,7 @@ from reenact.config import Config
 from reenact.data import Studio
 from reenact.errors import ReenactError
 from reenact.models import Networks
-from reenact.pairs import find_pairs
+from reenact.pairs import Pairs, find_pairs
 from reenact.rigs.clip import Clip
 from reenact.run import Run
 
@@ -106,8 +107,12 @@ class ImageRetargeter:
     def paired(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"] | None:
         """The target's weights by the pairs of shapes that training learnt from, without any network; None if none.
 
-        Where every shape has its partner this is copying by look, and better than any network that learns from it.
+        Where every shape has its partner this is copying by look, which a network that learns from it cannot beat.
         """
         if self.config.pairs.method == "none":
             return None
-        return find_pairs(self.source_studio, self.target_studio, self.config.pairs).weights(weights)
+        return self._pairs.weights(weights)
+
+    @cached_property
+    def _pairs(self) -> Pairs:
+        return find_pairs(self.source_studio, self.target_studio, self.config.pairs)
