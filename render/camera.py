@@ -19,7 +19,7 @@ class Camera:
 
     world_to_camera: Float[Tensor, "3 4"]
     """Rotation and translation (metres) that take a world point to camera space."""
-    focal: float
+    focal: float | Float[Tensor, ""]
     """Focal length in units of half the image height: 1 / tan(half the vertical field of view)."""
 
     def __post_init__(self) -> None:
@@ -27,7 +27,7 @@ class Camera:
             raise ValueError(f"camera: expected a positive focal length, got {self.focal}")
 
     @staticmethod
-    def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"], focal: float) -> Camera:
+    def look_at(eye: Float[Tensor, "3"], target: Float[Tensor, "3"], focal: float | Float[Tensor, ""]) -> Camera:
         """The camera at `eye` that has `target` in the middle of its picture and +Y upright."""
         backward = torch.nn.functional.normalize(eye - target, dim=0)
         up = torch.tensor([0.0, 1.0, 0.0], dtype=eye.dtype, device=eye.device)

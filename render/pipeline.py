@@ -6,19 +6,31 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from render.antialias import antialias
+from render.antialias import Meeting, blend, distances, edge_points, find_crossings
 from render.camera import Camera
 from render.interpolate import barycentrics, interpolate
+from render.kernels.cpu import Mesh
 from render.kernels.function import Fused, Scene, topology
 from render.rasterize import rasterize
-from render.shade import Light, linear_from_srgb, sample_texture, shade, srgb_from_linear, unit, vertex_normals
+from render.shade import (
+    Light,
+    level_of_detail,
+    linear_from_srgb,
+    mip_maps,
+    sample_texture,
+    shade,
+    srgb_from_linear,
+    texel_areas,
+    unit,
+    vertex_normals,
+)
 
 BUFFERS = ("color", "mask", "normals", "depth", "parts", "attributes")
 
@@ -75,20 +87,18 @@ def render(
     """
     _check(vertices, faces, height, width, colors, texture, uv, uv_faces, parts, attributes, background, buffers)
     dtype = vertices.dtype
-    face_array, edge_array = topology(faces, vertices.shape[1])
     number = np.float64 if dtype == torch.float64 else np.float32
+    topology_arrays = topology(faces, vertices.shape[1])
     if texture is None:
-        uv_array, uv_face_array = np.zeros((0, 2), number), np.zeros((0, 3), np.int32)
+        texels, levels = torch.zeros(0, 3, dtype=dtype), np.zeros((0, 3), np.int64)
+        uv_arrays = np.zeros((0, 2), number), np.zeros((0, 3), np.int32), np.zeros(0, number)
     else:
-        uv_array = np.ascontiguousarray(uv.detach().to(dtype).numpy())
-        uv_face_array = face_array if uv_faces is None else np.ascontiguousarray(uv_faces.numpy(), dtype=np.int32)
+        rows, columns, corners = *texture.shape[:2], faces if uv_faces is None else uv_faces
+        texels, levels = _remembered(_texels, texture, dtype=dtype)
+        uv_arrays = _remembered(_texture_arrays, uv, corners, rows=rows, columns=columns, dtype=dtype)
     scene = Scene(
-        faces=face_array,
-        edges=edge_array,
-        uv=uv_array,
-        uv_faces=uv_face_array,
-        phong=np.array([light.ambient, light.diffuse, light.specular, light.shininess], number),
-        lens=np.array([camera.focal * height / 2, (width - 1) / 2, (height - 1) / 2], number),
+        mesh=Mesh(*topology_arrays, *uv_arrays, levels),
+        axis=((width - 1) / 2, (height - 1) / 2),
         background=linear_from_srgb(torch.tensor(list(background), dtype=dtype)).numpy(),
         height=height,
         width=width,
@@ -101,10 +111,12 @@ def render(
     color, mask, extras, inverse_depth, part_img = Fused.apply(
         vertices,
         camera.world_to_camera.to(dtype),
-        torch.ones(vertices.shape[1], 3, dtype=dtype) if colors is None else _linear(colors, dtype),
-        torch.zeros(0, 0, 3, dtype=dtype) if texture is None else _linear(texture, dtype),
+        torch.as_tensor(camera.focal, dtype=dtype) * (height / 2),
+        torch.ones(vertices.shape[1], 3, dtype=dtype) if colors is None else _remembered(_linear, colors, dtype=dtype),
+        texels,
         attributes.to(dtype),
         camera.to_camera(light.position.to(dtype)),
+        light.coefficients.to(dtype),
         scene,
     )
     normals = 3 if "normals" in buffers else 0
@@ -116,21 +128,41 @@ def render(
     return {name: made[name] for name in buffers}
 
 
-_linear_colors: OrderedDict[tuple[int, torch.dtype], tuple[Tensor, int, Tensor]] = OrderedDict()
+_known: OrderedDict[tuple, tuple[tuple[Tensor, ...], tuple[int, ...], object]] = OrderedDict()
+
+
+def _remembered(function: Callable, *tensors: Tensor, **settings):
+    """`function` of tensors that are the same in each call, such as a rig's colours; computed once for the last few."""
+    if any(tensor.requires_grad for tensor in tensors):
+        return function(*tensors, **settings)
+    key = (function, *map(id, tensors), *settings.values())
+    versions = tuple(tensor._version for tensor in tensors)  # counts changes in place
+    known = _known.get(key)
+    # The tensors are kept, so that an id is not given to another.
+    if known is None or known[1] != versions:
+        known = _known[key] = (tensors, versions, function(*tensors, **settings))
+        while len(_known) > 32:
+            _known.popitem(last=False)
+    return known[2]
 
 
 def _linear(srgb: Tensor, dtype: torch.dtype) -> Tensor:
-    """Linear light of colours; remembered for the last few tensors, since a rig's colours are the same in each call."""
-    if srgb.requires_grad:
-        return linear_from_srgb(srgb.to(dtype))
-    key = id(srgb), dtype
-    known = _linear_colors.get(key)
-    # The tensor is kept, so its id is not given to another; _version counts changes in place.
-    if known is None or known[0] is not srgb or known[1] != srgb._version:
-        known = _linear_colors[key] = (srgb, srgb._version, linear_from_srgb(srgb.to(dtype)))
-        while len(_linear_colors) > 16:
-            _linear_colors.popitem(last=False)
-    return known[2]
+    return linear_from_srgb(srgb.to(dtype))
+
+
+def _texels(texture: Tensor, dtype: torch.dtype) -> tuple[Tensor, np.ndarray]:
+    """All levels of an sRGB texture in one row of linear texels; first texel, rows and columns of each level."""
+    levels = mip_maps(linear_from_srgb(texture.to(dtype)))
+    sizes = [tuple(level.shape[:2]) for level in levels]
+    starts = np.cumsum([0, *(rows * columns for rows, columns in sizes[:-1])])
+    table = np.array([(start, rows, columns) for start, (rows, columns) in zip(starts, sizes)], np.int64)
+    return torch.cat([level.flatten(0, 1) for level in levels]), table
+
+
+def _texture_arrays(uv: Tensor, uv_faces: Tensor, rows: int, columns: int, dtype: torch.dtype) -> tuple:
+    uv = uv.detach().to(dtype)
+    areas = texel_areas(uv, uv_faces, rows, columns)
+    return np.ascontiguousarray(uv.numpy()), np.ascontiguousarray(uv_faces.numpy(), dtype=np.int32), areas.numpy()
 
 
 def render_by_stages(
@@ -152,28 +184,52 @@ def render_by_stages(
     For reading, and for testing the compiled kernels; gradients are those of autograd.
     """
     vertices_camera, vertices_clip = camera.to_camera(vertices), camera.project(vertices)
+    vertex_attributes = torch.cat([vertices_camera, vertex_normals(vertices_camera, faces)], -1)
+    texture_levels = None if texture is None else mip_maps(linear_from_srgb(texture))
+
+    def look(frames: slice, face_img: Tensor, bary_img: Tensor) -> Tensor:
+        """Colour, coverage, normal and attributes at points of faces; (B, H, W) -> (B, H, W, 7 + A)."""
+
+        def at_points(values: Tensor) -> Tensor:
+            return interpolate(values[frames], faces, face_img, bary_img)
+
+        covered = (face_img >= 0)[..., None]
+        points, normals = at_points(vertex_attributes).split(3, -1)
+        normals = unit(normals)
+        albedo = at_points(linear_from_srgb(colors).expand(len(vertices), -1, -1))
+        if texture_levels is not None:
+            uv_img = at_points(uv.expand(len(vertices), -1, -1))
+            owners = face_img.clamp(min=0)
+            areas = texel_areas(uv, faces, *texture.shape[:2])[owners]
+            corners = vertices_camera[frames][torch.arange(len(face_img))[:, None, None, None], faces[owners]]
+            volumes = torch.linalg.det(torch.where(covered[..., None], corners, torch.eye(3).to(corners)))
+            volumes, depths = -volumes, torch.where(covered[..., 0], -points[..., 2], 1.0)
+            focal = torch.as_tensor(camera.focal) * height / 2
+            level = level_of_detail(areas, volumes, depths, focal, len(texture_levels))
+            albedo = albedo * sample_texture(texture_levels, uv_img, level)
+        color = shade(albedo, normals, points, camera.to_camera(light.position.to(vertices)), light)
+        color = torch.where(covered, color, linear_from_srgb(torch.tensor(list(background)).to(vertices)))
+        parts = [color, covered.to(vertices), torch.where(covered, normals, 0.0)]
+        return torch.cat(parts if attributes is None else [*parts, at_points(attributes)], -1)
+
     face_img = rasterize(vertices_clip, faces, height, width)
-    bary_img = barycentrics(vertices_clip, faces, face_img)
-    points = interpolate(vertices_camera, faces, face_img, bary_img)
-    normals = unit(interpolate(vertex_normals(vertices_camera, faces), faces, face_img, bary_img))
-    albedo = interpolate(linear_from_srgb(colors).expand(len(vertices), -1, -1), faces, face_img, bary_img)
-    if texture is not None:
-        uv_img = interpolate(uv.expand(len(vertices), -1, -1), faces, face_img, bary_img)
-        albedo = albedo * sample_texture(linear_from_srgb(texture), uv_img)
-    covered = (face_img >= 0)[..., None]
-    color_img = shade(albedo, normals, points, camera.to_camera(light.position.to(vertices)), light)
-    color_img = torch.where(covered, color_img, linear_from_srgb(torch.tensor(list(background)).to(vertices)))
-    if attributes is None:
-        attributes = vertices.new_zeros(len(vertices), vertices.shape[1], 0)
-    attribute_img = interpolate(attributes, faces, face_img, bary_img)
-    everything = torch.cat([color_img, covered.to(vertices), torch.where(covered, normals, 0.0), attribute_img], -1)
-    blended = antialias(everything, face_img, vertices_clip, faces).movedim(-1, 1)  # (B, 7 + A, H, W)
-    color_img, mask, normals, attribute_img = blended.split([3, 1, 3, attributes.shape[-1]], 1)
+    everything = look(slice(None), face_img, barycentrics(vertices_clip, faces, face_img))
+    blended = []
+    for frame, crossings in enumerate(find_crossings(face_img, vertices_clip, faces)):
+        owners, coordinates = edge_points(crossings, vertices_clip[frame], faces, height, width)
+        edge_colors = look(slice(frame, frame + 1), owners[None, None], coordinates[None, None])[0, 0]
+        meets = [n for n, crossing in enumerate(crossings) if isinstance(crossing, Meeting)]
+        if meets:  # there the colour stays as it is up to the crossing
+            rows, columns = torch.tensor([crossings[n].surface for n in meets]).T
+            edge_colors = edge_colors.index_put((torch.tensor(meets),), everything[frame, rows, columns])
+        places = distances(crossings, vertices_clip[frame], faces, height, width)
+        blended.append(blend(everything[frame], edge_colors, places, crossings))
+    channels = torch.stack(blended).movedim(-1, 1)  # (B, 7 + A, H, W)
     return {
-        "color": srgb_from_linear(color_img),
-        "mask": mask.clamp(0, 1),
-        "normals": normals,
-        "attributes": attribute_img,
+        "color": srgb_from_linear(channels[:, :3]),
+        "mask": channels[:, 3:4].clamp(0, 1),
+        "normals": channels[:, 4:7],
+        "attributes": channels[:, 7:],
     }
 
 

@@ -23,19 +23,25 @@ class Light:
 
     position: Float[Tensor, "3"]
     """World space, metres."""
-    ambient: float = 0.25
+    ambient: float | Float[Tensor, ""] = 0.25
     """Share of the albedo that is seen without light."""
-    diffuse: float = 0.75
+    diffuse: float | Float[Tensor, ""] = 0.75
     """Share of the albedo that is seen where the light falls straight onto the surface."""
-    specular: float = 0.05
+    specular: float | Float[Tensor, ""] = 0.05
     """Linear intensity in the middle of the highlight."""
-    shininess: float = 16.0
+    shininess: float | Float[Tensor, ""] = 16.0
     """Exponent of the highlight; larger is smaller and sharper."""
 
     def __post_init__(self) -> None:
         for name in ("ambient", "diffuse", "specular", "shininess"):
             if not getattr(self, name) >= 0:
                 raise ValueError(f"light: expected {name} of 0 or more, got {getattr(self, name)}")
+
+    @property
+    def coefficients(self) -> Float[Tensor, "4"]:
+        """Ambient, diffuse, specular, shininess; a gradient reaches those that are tensors."""
+        numbers = (self.ambient, self.diffuse, self.specular, self.shininess)
+        return torch.stack([torch.as_tensor(number).to(self.position) for number in numbers])
 
 
 def linear_from_srgb(srgb: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
@@ -60,8 +66,75 @@ def vertex_normals(vertices: Float[Tensor, "B V 3"], faces: Int[Tensor, "F 3"]) 
     return unit(sums)
 
 
-def sample_texture(texture: Float[Tensor, "Ht Wt C"], uv_img: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch C"]:
-    """Bilinear lookup; (0, 0) is the top left corner, texel centres lie half a texel inside, borders are repeated."""
+def mip_maps(texture: Float[Tensor, "Ht Wt C"]) -> list[Float[Tensor, "_rows _columns C"]]:
+    """The texture and copies of it, each with half as many rows and columns, down to one texel.
+
+    An odd last row or column counts twice.
+
+    Williams 1983, "Pyramidal Parametrics", doi:10.1145/964967.801126. Mean values: give it linear light.
+    """
+    levels = [texture]
+    while max(levels[-1].shape[:2]) > 1:
+        smaller = levels[-1]
+        for axis, size in enumerate(smaller.shape[:2]):
+            if size > 1:
+                pairs = smaller if size % 2 == 0 else torch.cat([smaller, smaller.narrow(axis, size - 1, 1)], axis)
+                smaller = pairs.unflatten(axis, (-1, 2)).mean(axis + 1)
+        levels.append(smaller)
+    return levels
+
+
+def texel_areas(uv: Float[Tensor, "U 2"], uv_faces: Int[Tensor, "F 3"], rows: int, columns: int) -> Float[Tensor, "F"]:
+    """Twice the area of each face in the texture, in texels."""
+    first, second, third = (uv * torch.tensor([columns, rows]).to(uv))[uv_faces].unbind(1)
+    a, b = second - first, third - first
+    return (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).abs()
+
+
+def level_of_detail(
+    texel_areas: Float[Tensor, "*batch"],
+    volumes: Float[Tensor, "*batch"],
+    depths: Float[Tensor, "*batch"],
+    focal: float | Float[Tensor, ""],
+    levels: int,
+) -> Float[Tensor, "*batch"]:
+    """How often a texture is to be halved until a texel is as large as a pixel, in area; 0 where it is larger already.
+
+    A pixel shows depth^3 / (volume focal^2) of a face, with the focal length in pixels and six times the volume between
+    the face and the eye. Hardware looks at the longer side of what a pixel shows (Williams 1983); area blurs less and
+    is smooth, so that its gradient can be followed (ours).
+
+    Args:
+        texel_areas: Twice the area of the sample's face in the texture, in texels.
+        volumes: Six times the volume between the face and the eye, cubic metres.
+        depths: Of the sample, metres.
+        focal: Pixels.
+        levels: Of the texture.
+    """
+    texels = texel_areas * depths**3 / (volumes.clamp(min=1e-30) * focal**2)
+    return (0.5 * texels.clamp(min=1.0).log2()).clamp(max=levels - 1)
+
+
+def sample_texture(
+    levels: list[Float[Tensor, "_rows _columns C"]],
+    uv_img: Float[Tensor, "*batch 2"],
+    level_of_detail: Float[Tensor, "*batch"],
+) -> Float[Tensor, "*batch C"]:
+    """Lookup between four texels of each of the two levels next to `level_of_detail`.
+
+    (0, 0) is the top left corner, texel centres lie half a texel inside, borders are repeated.
+    """
+    finer = level_of_detail.long()
+    between = (level_of_detail - finer)[..., None]
+    total = torch.zeros_like(uv_img[..., :1])
+    for number, texture in enumerate(levels):
+        share = torch.where((finer == number)[..., None], 1 - between, 0.0)
+        share = torch.where((finer == number - 1)[..., None], between, share)
+        total = total + share * _sample_level(texture, uv_img)
+    return total
+
+
+def _sample_level(texture: Float[Tensor, "Ht Wt C"], uv_img: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch C"]:
     rows, columns = texture.shape[:2]
     x = (uv_img[..., 0] * columns - 0.5).clamp(0, columns - 1)
     y = (uv_img[..., 1] * rows - 0.5).clamp(0, rows - 1)

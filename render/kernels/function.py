@@ -6,6 +6,7 @@ import os
 from collections import OrderedDict, deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import ClassVar
 
@@ -13,21 +14,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from render.antialias import DEPTH_MARGIN, edges_of
+from render.antialias import DEPTH_MARGIN, edges_of, neighbours_of
 from render.kernels import cpu
 from render.rasterize import NEAR
+
+CORES = os.cpu_count() or 1
 
 
 @dataclass(frozen=True)
 class Scene:
     """What is the same in every frame of a call and takes no gradient."""
 
-    faces: np.ndarray  # (F, 3) int32
-    edges: np.ndarray  # (E, 4) int32
-    uv: np.ndarray  # (U, 2), empty without a texture
-    uv_faces: np.ndarray  # (F, 3) int32, empty without a texture
-    phong: np.ndarray  # ambient, diffuse, specular, shininess
-    lens: np.ndarray  # focal length, column and row of the optical axis, in pixels
+    mesh: cpu.Mesh
+    axis: tuple[float, float]  # column and row of the optical axis
     background: np.ndarray  # linear
     height: int
     width: int
@@ -37,7 +36,8 @@ class Scene:
 
 
 class Fused(torch.autograd.Function):
-    """World vertices, 3 x 4 camera matrix, linear colours and texture, attributes, camera-space light -> pictures.
+    """World vertices, camera matrix, focal length in pixels, colours and texels (both linear), attributes, camera-space
+    light and its four coefficients -> pictures.
 
     Returns colour, mask, extras (normals if the scene asks for them, then attributes), inverse depth and parts; None
     for the last two if the scene does not ask for them.
@@ -48,37 +48,44 @@ class Fused(torch.autograd.Function):
         ctx,
         world: Tensor,
         matrix: Tensor,
+        focal: Tensor,
         colors: Tensor,
-        texture: Tensor,
+        texels: Tensor,
         attributes: Tensor,
         light: Tensor,
+        phong: Tensor,
         scene: Scene,
     ) -> tuple[Tensor | None, ...]:
         batch = len(world)
-        height, width = scene.height, scene.width
+        height, width, mesh = scene.height, scene.width, scene.mesh
         color, mask = world.new_empty(batch, 3, height, width), world.new_empty(batch, 1, height, width)
         extra_channels = (3 if scene.with_normals else 0) + attributes.shape[-1]
         extras = world.new_empty(batch, extra_channels, height, width)
-        inputs = [tensor.detach().contiguous() for tensor in (world, matrix, colors, texture, attributes, light)]
-        limits = np.array([NEAR, DEPTH_MARGIN], scene.lens.dtype)
-        workspace = Workspace.borrow(batch, world.shape[1], 4 + extra_channels, scene)
-        kept = workspace.arrays
-        over_frames(
-            cpu.forward, batch, *_scene_arrays(scene, *inputs), limits, scene.background,
-            kept["finite"], kept["vertices"], kept["screen"], kept["vertex_normals"], kept["front"], kept["face_img"],
-            kept["inverse_img"], kept["image"], kept["pair_img"], kept["crossing_img"], kept["blended"],
-            color, mask, extras, kept["scratch_faces"],
-        )  # fmt: skip
-        if not kept["finite"].all():
+        inputs = [
+            tensor.detach().contiguous() for tensor in (world, matrix, focal, colors, texels, attributes, light, phong)
+        ]
+        look, attributes = _look(inputs, scene), inputs[5]
+        number = look.lens.dtype
+        workspace = Workspace(batch, world.shape[1], 4 + extra_channels, scene, number)
+        kept, near, margin = workspace.memory.kept, number.type(NEAR), number.type(DEPTH_MARGIN)
+        candidates, tiles = workspace.memory.candidates, tile_count(batch, height)
+        world, pictures = inputs[0], (color.numpy(), mask.numpy(), extras.numpy())
+        if tiles == 1:
+            spread(cpu.forward, batch, world.numpy(), mesh, look, attributes.numpy(), (near, margin), kept, candidates,
+                   *pictures)  # fmt: skip
+        else:
+            spread(cpu.forward_vertices, batch, world.numpy(), mesh, look, near, kept)
+            spread(cpu.forward_pixels, batch * tiles, tiles, mesh, look, attributes.numpy(), kept, candidates)
+            spread(cpu.forward_silhouettes, batch, mesh, look, attributes.numpy(), margin, kept)
+            spread(cpu.forward_encoding, batch * tiles, tiles, kept, *pictures)
+        if not kept.finite.all():
             _report_not_finite(world)
-        inverse_img = torch.from_numpy(kept["inverse_img"]).clone()[:, None] if scene.with_depth else None
+        inverse_img = torch.from_numpy(kept.inverse_img).clone()[:, None] if scene.with_depth else None
         part_img = None
         if scene.parts is not None:
             part_img = torch.empty(batch, 1, height, width, dtype=torch.int64)
-            over_frames(
-                cpu.parts_at_pixels, batch, kept["vertices"], scene.faces, scene.parts, scene.lens, kept["face_img"],
-                part_img,
-            )  # fmt: skip
+            spread(cpu.parts_at_pixels, batch, kept.vertices, mesh.faces, scene.parts, look.lens, kept.face_img,
+                   part_img.numpy())  # fmt: skip
             ctx.mark_non_differentiable(part_img)
         if any(ctx.needs_input_grad):
             ctx.scene, ctx.workspace = scene, workspace
@@ -90,97 +97,127 @@ class Fused(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, *g_pictures: Tensor | None) -> tuple:
         *inputs, color = ctx.saved_tensors
-        world, _, colors, texture, attributes, _ = inputs
-        kept = ctx.workspace.arrays
-        _, wants_matrix, wants_colors, wants_texture, wants_attributes, wants_light, _ = ctx.needs_input_grad
-        batch, zeros = len(world), world.new_zeros
-        nothing = zeros(batch, 0, 0, 0)
-        g_world = torch.empty_like(world)
-        g_matrix = zeros(batch, 3 if wants_matrix else 0, 4)
-        g_colors = zeros(batch, *(colors.shape if wants_colors else (0, 3)))
-        g_texture = zeros(batch, *(texture.shape if wants_texture else (0, 0, 3)))
-        g_attributes = zeros(batch, *(attributes.shape[1:] if wants_attributes else (0, attributes.shape[-1])))
-        g_light = zeros(batch, 3)
-        over_frames(
-            cpu.backward, batch, *_scene_arrays(ctx.scene, *inputs),
-            kept["vertices"], kept["screen"], kept["vertex_normals"], kept["face_img"], kept["image"],
-            kept["pair_img"], kept["crossing_img"], kept["blended"], color,
-            *(nothing if gradient is None else gradient.contiguous() for gradient in g_pictures[:4]),
-            g_world, g_matrix, g_colors, g_texture, g_attributes, g_light,
-            kept["scratch_blended"], kept["scratch_image"], kept["scratch_screen"], kept["scratch_vertex_normals"],
-            kept["scratch_vertices"],
-        )  # fmt: skip
-        # Frames were kept apart up to here, so that the sums do not depend on the threads.
+        world, _, _, colors, texels, attributes, _, _ = inputs
+        scene, kept = ctx.scene, ctx.workspace.memory.kept
+        _, wants_matrix, wants_focal, wants_colors, wants_texels, wants_attributes, wants_light, wants_phong, _ = (
+            ctx.needs_input_grad
+        )
+        batch, look = len(world), _look(inputs, scene)
+        tiles = tile_count(batch, scene.height)
+        pieces, number = batch * tiles, look.lens.dtype
+        scratch, (g_vertices, g_normals, g_screen) = ctx.workspace.memory.backward(tiles)
+        zeros = partial(np.zeros, dtype=number)
+        sums = cpu.Sums(
+            vertices=g_vertices,
+            normals=g_normals,
+            screen=g_screen,
+            colors=zeros((pieces, *(colors.shape if wants_colors else (0, 3)))),
+            texels=zeros((pieces, *(texels.shape if wants_texels else (0, 3)))),
+            attributes=zeros((pieces, *(attributes.shape[1:] if wants_attributes else (0, attributes.shape[-1])))),
+            light=zeros((pieces, 3)),
+            phong=zeros((pieces, 4)),
+            lens=zeros((pieces, 3)),
+        )
+        g_world, g_matrix = torch.empty_like(world), zeros((batch, 3 if wants_matrix else 0, 4))
+        nothing = zeros((batch, 0, 0, 0))
+        g_color, g_mask, g_extras, g_inverse = (
+            nothing if gradient is None else gradient.contiguous().numpy() for gradient in g_pictures[:4]
+        )
+        shared = scene.mesh, look, attributes.numpy(), wants_phong, kept
+        if tiles == 1:
+            spread(cpu.backward, batch, world.numpy(), *shared, color.numpy(), g_color, g_mask, g_extras, g_inverse,
+                   scratch, sums, g_world.numpy(), g_matrix)  # fmt: skip
+        else:
+            spread(cpu.backward_encoding, pieces, tiles, kept, color.numpy(), g_color, g_mask, g_extras, scratch, sums)
+            spread(cpu.backward_silhouettes, batch, tiles, *shared, scratch, sums)
+            spread(cpu.backward_pixels, pieces, tiles, *shared, g_inverse, scratch, sums)
+            spread(cpu.backward_vertices, batch, tiles, world.numpy(), scene.mesh, look, kept, sums, g_world.numpy(),
+                   g_matrix)  # fmt: skip
+        # Pieces were kept apart up to here, so that the sums do not depend on the threads.
+        total = {name: torch.from_numpy(getattr(sums, name)) for name in cpu.Sums._fields[3:]}
         return (
             g_world,
-            g_matrix.sum(0) if wants_matrix else None,
-            g_colors.sum(0) if wants_colors else None,
-            g_texture.sum(0) if wants_texture else None,
-            g_attributes if wants_attributes else None,
-            g_light.sum(0) if wants_light else None,
+            torch.from_numpy(g_matrix).sum(0) if wants_matrix else None,
+            total["lens"].sum(0)[0] if wants_focal else None,
+            total["colors"].sum(0) if wants_colors else None,
+            total["texels"].sum(0) if wants_texels else None,
+            total["attributes"].unflatten(0, (batch, tiles)).sum(1) if wants_attributes else None,
+            total["light"].sum(0) if wants_light else None,
+            total["phong"].sum(0) if wants_phong else None,
             None,
         )
 
 
-class Workspace:
-    """What the forward pass leaves for the backward pass, borrowed from those of earlier calls of the same sizes.
+class Memory:
+    """What the forward pass leaves for the backward pass, and what both work in; contents are undefined at first."""
 
-    Fresh memory costs as much as all arithmetic (page faults, 160 a frame at 7,000 vertices and 64 pixels). A workspace
-    goes back when the last graph that holds it is gone.
+    def __init__(
+        self, batch: int, vertices: int, faces: int, height: int, width: int, channels: int, number: str
+    ) -> None:
+        self._shape = batch, vertices, height, width, channels, number
+        pixels, crossings, empty = height * width, 2 * height * width, np.empty
+        # There are as many places for crossings as pairs of pixels; what is not used is never touched, and so not real.
+        self.kept = cpu.Kept(
+            finite=empty(batch, np.bool_),
+            vertices=empty((batch, vertices, 3), number),
+            screen=empty((batch, vertices, 3), number),
+            normals=empty((batch, vertices, 4), number),
+            sides=empty((batch, faces), np.uint8),
+            face_img=empty((batch, height, width), np.int32),
+            inverse_img=empty((batch, height, width), number),
+            samples=empty((batch, pixels + crossings, channels), number),
+            pair_img=empty((batch, 2, height, width), np.int32),
+            places=empty((batch, crossings, 6), np.int32),
+            crossings=empty((batch, crossings, 3), number),
+            mixed=empty((batch, crossings, 2, channels), number),
+            counts=empty(batch, np.int64),
+        )
+        self.candidates = empty((CORES, faces + 1), np.int32)
+        self._backward: dict[int, tuple] = {}
+
+    def backward(self, tiles: int) -> tuple[cpu.Scratch, tuple[np.ndarray, ...]]:
+        """One piece for each thread, or with tiles for each frame and tile."""
+        if tiles not in self._backward:
+            batch, vertices, height, width, channels, number = self._shape
+            frames, pieces = (CORES, CORES) if tiles == 1 else (batch, batch * tiles)
+            crossings = 2 * height * width
+            scratch = cpu.Scratch(
+                samples=np.empty((frames, height * width + crossings, channels), number),
+                mixed=np.empty((frames, crossings, 2, channels), number),
+            )
+            self._backward[tiles] = scratch, tuple(np.empty((pieces, vertices, 3), number) for _ in range(3))
+        return self._backward[tiles]
+
+
+class Workspace:
+    """Memory borrowed from that of earlier calls of the same sizes.
+
+    Fresh memory costs as much as all arithmetic (page faults, 160 a frame at 7,000 vertices and 64 pixels). It goes
+    back when the last graph that holds the workspace is gone.
     """
 
-    _idle: ClassVar[OrderedDict[tuple, list[dict[str, np.ndarray]]]] = OrderedDict()
+    _idle: ClassVar[OrderedDict[tuple, list[Memory]]] = OrderedDict()
     _KINDS_KEPT = 4
 
-    def __init__(self, key: tuple, arrays: dict[str, np.ndarray]) -> None:
-        self._key = key
-        self.arrays = arrays
-
-    @classmethod
-    def borrow(cls, batch: int, vertices: int, channels: int, scene: Scene) -> Workspace:
-        """A workspace that nobody else uses; its contents are undefined."""
-        number, height, width = scene.lens.dtype, scene.height, scene.width
-        workers = os.cpu_count() or 1  # the backward pass may run on more threads than the forward pass
-        key = (batch, vertices, len(scene.faces), height, width, channels, number.str)
+    def __init__(self, batch: int, vertices: int, channels: int, scene: Scene, number: np.dtype) -> None:
+        self._key = batch, vertices, len(scene.mesh.faces), scene.height, scene.width, channels, number.str
         try:
-            return cls(key, cls._idle[key].pop())
+            self.memory = self._idle[self._key].pop()
         except (KeyError, IndexError):
-            pass
-        pixels = (batch, height, width)
-        arrays = {
-            "finite": np.empty(batch, np.bool_),
-            "vertices": np.empty((batch, vertices, 3), number),
-            "screen": np.empty((batch, vertices, 3), number),
-            "vertex_normals": np.empty((batch, vertices, 4), number),
-            "front": np.empty((batch, len(scene.faces)), np.uint8),
-            "face_img": np.empty(pixels, np.int32),
-            "inverse_img": np.empty(pixels, number),
-            "image": np.empty((*pixels, channels), number),
-            "blended": np.empty((*pixels, channels), number),
-            "pair_img": np.empty((batch, 2, height, width), np.int32),
-            "crossing_img": np.empty((batch, 2, height, width), number),
-            "scratch_faces": np.empty((workers, len(scene.faces) + 1), np.int32),
-            "scratch_blended": np.empty((workers, height, width, channels), number),
-            "scratch_image": np.empty((workers, height, width, channels), number),
-            "scratch_screen": np.empty((workers, vertices, 2), number),
-            "scratch_vertex_normals": np.empty((workers, vertices, 3), number),
-            "scratch_vertices": np.empty((workers, vertices, 3), number),
-        }
-        return cls(key, arrays)
+            self.memory = Memory(*self._key)
 
     def __del__(self) -> None:
         idle = self._idle.setdefault(self._key, [])
         if len(idle) < 2:
-            idle.append(self.arrays)
+            idle.append(self.memory)
         while len(self._idle) > self._KINDS_KEPT:
             self._idle.popitem(last=False)
 
 
-def _scene_arrays(scene: Scene, world, matrix, colors, texture, attributes, light) -> tuple:
-    return (
-        world, matrix, scene.faces, scene.edges, colors, scene.uv, scene.uv_faces, texture, attributes, light,
-        scene.phong, scene.lens,
-    )  # fmt: skip
+def _look(inputs: list[Tensor], scene: Scene) -> cpu.Look:
+    _, matrix, focal, colors, texels, _, light, phong = (tensor.numpy() for tensor in inputs)
+    lens = np.array([focal, *scene.axis], focal.dtype)
+    return cpu.Look(matrix, lens, light, phong, colors, texels, scene.background)
 
 
 def _report_not_finite(world: Tensor) -> None:
@@ -194,30 +231,37 @@ def _report_not_finite(world: Tensor) -> None:
     )
 
 
+def tile_count(batch: int, height: int) -> int:
+    """Bands of rows into which each frame is cut: one, unless there are fewer frames than cores.
+
+    It depends on the cores of the machine and not on the threads in use, so that sums do not either.
+    """
+    return max(1, min(CORES // batch, height // 8, 8)) if batch else 1
+
+
 _pool: ThreadPoolExecutor | None = None
 
 
-def over_frames(kernel, batch: int, *arrays: np.ndarray | Tensor) -> None:
-    """Run `kernel(worker, first, last, *arrays)` over all frames on as many threads as torch uses."""
-    arrays = tuple(array.numpy() if isinstance(array, Tensor) else array for array in arrays)
-    threads = min(_worker_count(), batch)
+def spread(kernel, pieces: int, *arguments) -> None:
+    """Run `kernel(worker, first, last, *arguments)` over all pieces on as many threads as torch uses."""
+    threads = min(_worker_count(), pieces)
     if threads <= 1:
-        kernel(0, 0, batch, *arrays)
+        kernel(0, 0, pieces, *arguments)
         return
-    # Small pieces, the calling thread among those who take them: a core that is busy with something else takes fewer.
-    bounds = np.linspace(0, batch, min(batch, 4 * threads) + 1).round().astype(int).tolist()
-    pieces = deque(pairwise(bounds))
+    # Small parts, the calling thread among those who take them: a core that is busy with something else takes fewer.
+    bounds = np.linspace(0, pieces, min(pieces, 4 * threads) + 1).round().astype(int).tolist()
+    parts = deque(pairwise(bounds))
 
     def work(worker: int) -> None:
         while True:
             try:
-                first, last = pieces.popleft()
+                first, last = parts.popleft()
             except IndexError:
                 return
-            kernel(worker, first, last, *arrays)
+            kernel(worker, first, last, *arguments)
 
     if not kernel.signatures:
-        kernel(0, *pieces.popleft(), *arrays)  # compiles once, not in every thread
+        kernel(0, *parts.popleft(), *arguments)  # compiles once, not in every thread
     helpers = [_workers().submit(work, worker) for worker in range(1, threads)]
     work(0)
     for helper in helpers:
@@ -225,13 +269,13 @@ def over_frames(kernel, batch: int, *arrays: np.ndarray | Tensor) -> None:
 
 
 def _worker_count() -> int:
-    return max(1, min(torch.get_num_threads(), os.cpu_count() or 1))
+    return max(1, min(torch.get_num_threads(), CORES))
 
 
 def _workers() -> ThreadPoolExecutor:
     global _pool
     if _pool is None:
-        _pool = ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="render")
+        _pool = ThreadPoolExecutor(CORES, thread_name_prefix="render")
     return _pool
 
 
@@ -243,11 +287,11 @@ def _forget_workers() -> None:
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_workers)  # threads do not survive a fork; the child starts its own
 
-_topologies: OrderedDict[int, tuple[Tensor, int, np.ndarray, np.ndarray]] = OrderedDict()
+_topologies: OrderedDict[int, tuple[Tensor, int, tuple[np.ndarray, np.ndarray, np.ndarray]]] = OrderedDict()
 
 
-def topology(faces: Tensor, vertex_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Faces and edges as the kernels want them; remembered for the last few `faces` tensors.
+def topology(faces: Tensor, vertex_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Faces, edges and neighbours as the kernels want them; remembered for the last few `faces` tensors.
 
     Raises:
         ValueError: A face names a vertex that is not there.
@@ -255,17 +299,19 @@ def topology(faces: Tensor, vertex_count: int) -> tuple[np.ndarray, np.ndarray]:
     known = _topologies.get(id(faces))
     # The tensor is kept, so its id is not given to another; _version counts changes in place.
     if known is None or known[0] is not faces or known[1] != faces._version:
-        known = (faces, faces._version, _indices(faces), _indices(edges_of(faces)))
+        edges = edges_of(faces)
+        known = (faces, faces._version, tuple(map(_indices, (faces, edges, neighbours_of(faces, edges)))))
         _topologies[id(faces)] = known
         while len(_topologies) > 16:
             _topologies.popitem(last=False)
-    largest = int(known[3][:, :2].max()) if len(known[3]) else -1
-    if largest >= vertex_count or (len(known[2]) and int(known[2].min()) < 0):
+    face_array, edge_array, _ = known[2]
+    largest = int(edge_array[:, :2].max()) if len(edge_array) else -1
+    if largest >= vertex_count or (len(face_array) and int(face_array.min()) < 0):
         raise ValueError(
-            f"faces: expected vertex indices in 0..{vertex_count - 1}, got {int(known[2].min())}..{largest}; "
+            f"faces: expected vertex indices in 0..{vertex_count - 1}, got {int(face_array.min())}..{largest}; "
             "check that faces and vertices belong to the same mesh"
         )
-    return known[2], known[3]
+    return known[2]
 
 
 def _indices(tensor: Tensor) -> np.ndarray:
