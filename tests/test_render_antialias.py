@@ -7,7 +7,18 @@ import torch
 from render_scene import ambient, at_pixels, bumpy_spheres, flat_camera
 
 from render import render, render_by_stages
-from render.antialias import edges_of
+from render.antialias import (
+    Meeting,
+    Outline,
+    blend,
+    distances,
+    edge_points,
+    edges_of,
+    find_crossings,
+    inverse_depth,
+    neighbours_of,
+)
+from render.rasterize import rasterize
 
 SQUARE = torch.tensor([[0, 1, 2], [0, 2, 3]])
 
@@ -93,3 +104,102 @@ def test_edges_of_a_closed_surface_have_two_faces_each():
     edges = edges_of(faces)
     assert len(edges) == len(faces) * 3 // 2
     assert (edges[:, 3] >= 0).all()
+
+
+def test_neighbours_lie_across_the_edge_opposite_each_corner():
+    faces = torch.tensor([[0, 1, 2], [2, 3, 0]])
+    assert neighbours_of(faces, edges_of(faces)).tolist() == [[-1, 1, -1], [-1, 0, -1]]
+
+
+def test_a_surface_keeps_its_colour_up_to_the_crossing():
+    # A ramp from black at the centre of column 4 to 1 at the edge, which lies 0.8 columns on; what is behind is 0.5.
+    outline = Outline((0, 4), (0, 5), (0, 1), 0, 1.0)
+    row = torch.full((1, 8, 1), 0.5, dtype=torch.float64)
+    row[0, 4] = 0
+    blended = blend(row, torch.ones(1, 1, dtype=torch.float64), torch.tensor([0.8], dtype=torch.float64), [outline])
+    # Integrals of x / 0.8 over [0, 0.5] and [0.5, 0.8]; the rest of column 5 is behind.
+    assert blended[0, 4, 0].item() == pytest.approx(0.5**2 / 2 / 0.8, abs=1e-12)  # float64
+    assert blended[0, 5, 0].item() == pytest.approx((0.8**2 - 0.5**2) / 2 / 0.8 + 0.7 * 0.5, abs=1e-12)
+
+
+def crossed_planes() -> tuple[torch.Tensor, torch.Tensor]:
+    """Two squares that pass through one another along an upright line at column 7.3 of a 12 x 16 picture.
+
+    Their depths are 2 and 1 at column -3 and as much apart the other way at column 17.6.
+    """
+    left, right = -3.0, 17.6
+    first = torch.cat([at_pixels([(left, -3), (left, 14)], 12, 16, 2.0), at_pixels([(right, 14), (right, -3)], 12, 16)])
+    second = torch.cat(
+        [at_pixels([(left, -3), (left, 14)], 12, 16), at_pixels([(right, 14), (right, -3)], 12, 16, 2.0)]
+    )
+    return torch.cat([first, second])[None], torch.cat([SQUARE, SQUARE + 4])
+
+
+def test_two_sheets_that_pass_through_one_another_are_blended_where_they_meet():
+    vertices, faces = crossed_planes()
+    # Inverse depths are linear in the picture: equal half way, at column 7.3.
+    colors = torch.tensor([[1.0, 0.0, 0.0]] * 4 + [[0.0, 0.0, 1.0]] * 4, dtype=torch.float64)
+    arguments = {"height": 12, "width": 16, "colors": colors}
+    for made in (
+        render(vertices, faces, flat_camera(12), ambient(), **arguments),
+        render_by_stages(vertices, faces, flat_camera(12), ambient(), **arguments),
+    ):
+        red, _, blue = made["color"][0, :, 6, 7]
+        # Column 7 is blue from 6.5 to 7.3, then red, in linear light.
+        assert blue.item() == pytest.approx(1.055 * 0.8 ** (1 / 2.4) - 0.055, abs=1e-5)  # the kernel's sRGB: 6e-7
+        assert red.item() == pytest.approx(1.055 * 0.2 ** (1 / 2.4) - 0.055, abs=1e-5)
+
+
+def test_where_two_sheets_meet_moves_with_both():
+    vertices, faces = crossed_planes()
+    vertices = vertices.requires_grad_()
+    attributes = torch.tensor([[0.0]] * 4 + [[1.0]] * 4, dtype=torch.float64)[None]
+    made = render(
+        vertices, faces, flat_camera(12), ambient(), height=12, width=16, attributes=attributes, buffers=("attributes",)
+    )  # fmt: skip
+    made["attributes"].sum().backward()
+    # Inverse depths run from 1/2 to 1 and from 1 to 1/2 over 20.6 columns. A rise of the first by r at the left end is
+    # one of r / 2 where they meet, half way, and moves that place by 20.6 r / 2 columns to the left. A step of 1 m
+    # towards the eye at depth 2 is a rise of 1/4.
+    nearer = torch.zeros_like(vertices)
+    nearer[0, :2] = vertices[0, :2].detach() / -2  # along the ray: the picture of the corners stays
+    moved = (vertices.grad * nearer).sum().item()
+    assert moved == pytest.approx(-12 * 20.6 / 2 / 4, rel=1e-6)  # 12 rows
+
+
+@pytest.mark.parametrize("stage", ["outlines", "meetings", "edge_points", "blend", "inverse_depth"])
+def test_gradients_of_a_stage_match_finite_differences(stage):
+    if stage == "meetings":
+        vertices, faces = crossed_planes()
+        camera, height, width = flat_camera(12), 12, 16
+    else:
+        scene = bumpy_spheres()
+        vertices, faces, camera, height, width = scene["vertices"][:1], scene["faces"], scene["camera"], 14, 13
+    clip = camera.project(vertices)
+    crossings = find_crossings(rasterize(clip, faces, height, width), clip, faces)[0]
+    kind = Meeting if stage == "meetings" else Outline
+    crossings = [crossing for crossing in crossings if isinstance(crossing, kind)][:12]
+    assert len(crossings) == 12
+    corners = clip[0].clone().requires_grad_()
+    generator = torch.Generator().manual_seed(0)
+    if stage in ("outlines", "meetings"):
+        assert torch.autograd.gradcheck(lambda clip: distances(crossings, clip, faces, height, width), (corners,))
+    elif stage == "edge_points":
+        assert torch.autograd.gradcheck(lambda clip: edge_points(crossings, clip, faces, height, width)[1], (corners,))
+    elif stage == "blend":
+        picture = torch.rand(height, width, 2, dtype=torch.float64, generator=generator).requires_grad_()
+        edges = torch.rand(12, 2, dtype=torch.float64, generator=generator).requires_grad_()
+        places = distances(crossings, clip[0], faces, height, width).detach().requires_grad_()
+        assert torch.autograd.gradcheck(lambda *values: blend(*values, crossings), (picture, edges, places))
+    else:
+        triangle = torch.tensor([[1.0, 1.0], [2.0, 6.0], [7.0, 3.0]], dtype=torch.float64, requires_grad=True)
+        inverse = torch.tensor([0.5, 1.0, 0.7], dtype=torch.float64, requires_grad=True)
+        assert torch.autograd.gradcheck(lambda *values: inverse_depth(*values, 3.2, 2.5), (triangle, inverse))
+
+
+def test_at_most_one_crossing_lies_between_two_pixels():
+    scene = bumpy_spheres(2)
+    clip = scene["camera"].project(scene["vertices"])
+    for crossings in find_crossings(rasterize(clip, scene["faces"], 24, 20), clip, scene["faces"]):
+        pairs = [frozenset([crossing.surface, crossing.behind]) for crossing in crossings]
+        assert len(pairs) == len(set(pairs)) > 20

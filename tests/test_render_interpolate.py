@@ -6,6 +6,8 @@ import pytest
 import torch
 from render_scene import at_pixels, bumpy_spheres, flat_camera
 
+from render import Camera
+from render.camera import to_pixels
 from render.interpolate import barycentrics, interpolate
 from render.rasterize import rasterize
 
@@ -40,10 +42,24 @@ def test_interpolation_is_perspective_correct():
     assert found[0, 3, 4, 0].item() == pytest.approx(0.25, abs=1e-12)  # float64
 
 
-def test_gradients_of_barycentric_coordinates_match_finite_differences():
-    corners = at_pixels([(0.3, 0.4), (0.2, 3.7), (4.2, 0.1)], 4, 4)
-    corners[1] *= 1.3
-    faces = torch.tensor([[0, 1, 2]])
-    clip = flat_camera(4).project(corners)[None].requires_grad_()
-    face_img = rasterize(clip, faces, 4, 4)
-    torch.autograd.gradcheck(lambda clip: barycentrics(clip, faces, face_img), clip)
+@pytest.mark.parametrize("stage", ["barycentrics", "interpolate", "project", "to_pixels"])
+def test_gradients_of_a_stage_match_finite_differences(stage):
+    scene = bumpy_spheres()
+    faces, camera = scene["faces"], scene["camera"]
+    clip = camera.project(scene["vertices"][:1])
+    face_img = rasterize(clip, faces, 9, 8)
+    generator = torch.Generator().manual_seed(0)
+    if stage == "barycentrics":
+        function, inputs = (lambda clip: barycentrics(clip, faces, face_img)), (clip,)
+    elif stage == "interpolate":
+        attributes = torch.rand(1, clip.shape[1], 2, dtype=torch.float64, generator=generator)
+        coordinates = barycentrics(clip, faces, face_img)
+        function = lambda values, img: interpolate(values, faces, face_img, img)  # noqa: E731
+        inputs = (attributes, coordinates)
+    elif stage == "project":
+        function = lambda vertices, matrix, focal: Camera(matrix, focal).project(vertices)  # noqa: E731
+        inputs = (scene["vertices"][0, :5], camera.world_to_camera, torch.tensor(4.5, dtype=torch.float64))
+    else:
+        function, inputs = (lambda clip: to_pixels(clip, 9, 8)), (clip,)
+    leaves = tuple(value.detach().clone().requires_grad_() for value in inputs)
+    assert torch.autograd.gradcheck(function, leaves)

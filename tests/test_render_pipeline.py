@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import multiprocessing
+import resource
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,8 @@ import torch
 from render_scene import GREY, ambient, at_pixels, bumpy_spheres, flat_camera
 
 from render import Camera, Light, render, render_by_stages
+from render.kernels import function
+from render.kernels.function import Workspace
 from render.shade import linear_from_srgb, srgb_from_linear
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -36,6 +39,14 @@ def head() -> Head:
 
 def picture(scene: dict, height: int = 24, width: int = 20, buffers=FLOATS, **changes) -> dict:
     return render(**{**scene, **changes}, height=height, width=width, background=GREY, buffers=buffers)
+
+
+def meeting(vertices: torch.Tensor) -> torch.Tensor:
+    """The small ball half sunk into the front of the large one: neither outline bounds what is seen of it."""
+    count = vertices.shape[1] // 2
+    sunk = vertices.clone()
+    sunk[:, count:] += torch.tensor([-0.03, -0.01, -0.045], dtype=vertices.dtype)
+    return sunk
 
 
 # Closed forms
@@ -118,14 +129,15 @@ def test_frames_of_a_batch_do_not_know_each_other(scene):
         assert torch.equal(together[name][1:], alone[name])
 
 
-def test_threads_change_neither_picture_nor_gradient(head):
-    weights = torch.rand(5, 52, generator=torch.Generator().manual_seed(0))
+@pytest.mark.parametrize("frames", [1, 5])  # one frame is cut into bands of rows
+def test_threads_change_neither_picture_nor_gradient(head, frames):
+    weights = torch.rand(1, 52, generator=torch.Generator().manual_seed(0))
 
     def outcome(threads: int) -> list[torch.Tensor]:
         before = torch.get_num_threads()
         torch.set_num_threads(threads)
         try:
-            vertices = head.vertices(weights[:1]).repeat(5, 1, 1) + 0.001 * torch.arange(5.0)[:, None, None]
+            vertices = head.vertices(weights) + 0.001 * torch.arange(float(frames))[:, None, None]
             vertices, colors = vertices.requires_grad_(), head.colors.clone().requires_grad_()
             light = head.light.position.clone().requires_grad_()
             color = render(
@@ -139,6 +151,24 @@ def test_threads_change_neither_picture_nor_gradient(head):
 
     for one, two in zip(outcome(1), outcome(2)):
         assert torch.equal(one, two)
+
+
+def test_bands_of_rows_change_no_picture_and_gradients_to_rounding_only(scene, monkeypatch):
+    def outcome(cores: int) -> list[torch.Tensor]:
+        monkeypatch.setattr(function, "CORES", cores)
+        Workspace._idle.clear()  # scratch memory is made for so many threads
+        leaves = [scene[name].clone().requires_grad_() for name in ("vertices", "colors", "texture", "attributes")]
+        names = dict(zip(("vertices", "colors", "texture", "attributes"), leaves))
+        made = picture(scene, **names)
+        loss = sum((made[name] ** 2).sum() for name in FLOATS)
+        return [made[name].detach() for name in FLOATS], torch.autograd.grad(loss, leaves)
+
+    (whole, whole_gradients), (bands, band_gradients) = outcome(1), outcome(6)
+    Workspace._idle.clear()
+    for one, other in zip(whole, bands):
+        assert torch.equal(one, other)
+    for one, other in zip(whole_gradients, band_gradients):
+        torch.testing.assert_close(other, one, rtol=0, atol=1e-12 * float(one.abs().max()))  # float64, other order
 
 
 def test_later_pictures_leave_the_gradient_of_an_earlier_one_alone(scene):
@@ -175,6 +205,26 @@ def test_degenerate_faces_leave_picture_and_gradient_finite(scene):
     assert torch.isfinite(vertices.grad).all()
 
 
+def test_any_triangles_leave_picture_and_gradient_finite_and_memory_as_it_was(scene):
+    # Slivers, points, faces through the eye, far outside and larger than the picture, each frame another mixture.
+    generator = torch.Generator().manual_seed(0)
+    before = None
+    for turn in range(120):
+        vertices = scene["vertices"].clone()
+        chosen = torch.randperm(vertices.shape[1], generator=generator)[:12]
+        scales = 10 ** (6 * torch.rand(12, 1, dtype=torch.float64, generator=generator) - 3)
+        vertices[:, chosen] *= scales
+        vertices[:, chosen[:4]] = vertices[:, chosen[4:5]]
+        vertices.requires_grad_()
+        made = picture(scene, vertices=vertices)
+        sum(made[name].square().sum() for name in FLOATS).backward()
+        assert all(torch.isfinite(made[name]).all() for name in FLOATS)
+        assert torch.isfinite(vertices.grad).all()
+        if turn == 20:
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 20_000  # KiB; a leaked frame is 200
+
+
 def test_a_picture_of_one_pixel_is_made(scene):
     assert picture(scene, height=1, width=1)["mask"].tolist() == [[[[1.0]]], [[[1.0]]]]
 
@@ -183,13 +233,19 @@ def test_a_picture_of_one_pixel_is_made(scene):
 
 
 @pytest.mark.parametrize("buffer", FLOATS)
-def test_gradients_of_a_buffer_match_finite_differences(scene, buffer):
-    # Everything at once along one random direction each: vertices, colours, texture, light, camera.
+@pytest.mark.parametrize("kind", ["silhouettes", "fine texture", "sheets that meet"])
+def test_gradients_of_a_buffer_match_finite_differences(scene, kind, buffer):
+    # Along random directions each: vertices, colours, texture, attributes, light, camera.
     generator = torch.Generator().manual_seed(3)
+    if kind == "fine texture":  # a pixel shows many texels, so that the level of detail takes part
+        scene = {**scene, "texture": 0.2 + 0.6 * torch.rand(70, 41, 3, dtype=torch.float64, generator=generator)}
+    elif kind == "sheets that meet":
+        scene = {**scene, "vertices": meeting(scene["vertices"])}
+    light = scene["light"]
     values = {
         "vertices": scene["vertices"], "colors": scene["colors"], "texture": scene["texture"],
-        "light": scene["light"].position, "matrix": scene["camera"].world_to_camera,
-        "attributes": scene["attributes"],
+        "light": light.position, "matrix": scene["camera"].world_to_camera, "attributes": scene["attributes"],
+        "focal": torch.tensor(scene["camera"].focal, dtype=torch.float64), "coefficients": light.coefficients,
     }  # fmt: skip
     mix = None
 
@@ -197,8 +253,8 @@ def test_gradients_of_a_buffer_match_finite_differences(scene, buffer):
         nonlocal mix
         made = picture(
             scene, 14, 13, (buffer,), vertices=values["vertices"], colors=values["colors"], texture=values["texture"],
-            light=replace(scene["light"], position=values["light"]),
-            camera=Camera(values["matrix"], scene["camera"].focal), attributes=values["attributes"],
+            light=Light(values["light"], *values["coefficients"]), camera=Camera(values["matrix"], values["focal"]),
+            attributes=values["attributes"],
         )[buffer]  # fmt: skip
         mix = torch.randn(made.shape, dtype=made.dtype, generator=generator) if mix is None else mix
         return (made * mix).sum()
@@ -212,23 +268,32 @@ def test_gradients_of_a_buffer_match_finite_differences(scene, buffer):
             after, before = (loss({**values, name: value + sign * step * direction}).item() for sign in (1, -1))
             expected = (after - before) / (2 * step)
             found = 0.0 if gradient is None else (gradient * direction).sum()
-            # Differences of 1e-7 in float64, and the kernel's sRGB curve whose slope is off by 2e-5.
+            # Differences of 1e-7 in float64, and the slope of the kernel's sRGB curve, off by up to 6e-5 of it.
             scale = 1.0 if gradient is None else gradient.abs().max() * direction.norm()
-            assert abs(expected - found) < 5e-5 * max(scale, 1e-3), name
+            assert abs(expected - found) < 1e-4 * max(scale, 1e-3), name
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_gradients_for_weights_match_a_supersampled_picture_with_silhouettes(head, seed):
     # 4,842 vertices: triangles are smaller than pixels, which is where rules for large triangles lose the silhouettes.
     cosine, relative_error = gradient_accuracy(head, 64, seed=seed, shapes=16, samples=8)
-    assert cosine >= 0.995
-    assert relative_error < 0.12
+    assert cosine >= 0.999
+    assert relative_error < 0.05
 
 
 # Twin
 
 
-def test_the_fused_kernels_make_the_picture_of_the_readable_stages(scene):
+@pytest.fixture(params=["silhouettes", "fine texture", "sheets that meet"])
+def variant(request, scene) -> dict:
+    if request.param == "fine texture":
+        generator = torch.Generator().manual_seed(5)
+        return {**scene, "texture": torch.rand(70, 41, 3, dtype=torch.float64, generator=generator)}
+    return {**scene, "vertices": meeting(scene["vertices"])} if request.param == "sheets that meet" else scene
+
+
+def test_the_fused_kernels_make_the_picture_of_the_readable_stages(variant):
+    scene = variant
     fused = picture(scene)
     staged = render_by_stages(**scene, height=24, width=20, background=GREY)
     torch.testing.assert_close(fused["color"], staged["color"], rtol=0, atol=1e-6)  # the kernel's sRGB: 6e-7
@@ -236,7 +301,8 @@ def test_the_fused_kernels_make_the_picture_of_the_readable_stages(scene):
         torch.testing.assert_close(fused[name], staged[name], rtol=0, atol=1e-12)  # float64
 
 
-def test_the_fused_kernels_have_the_gradient_of_the_readable_stages(scene):
+def test_the_fused_kernels_have_the_gradient_of_the_readable_stages(variant):
+    scene = variant
     generator = torch.Generator().manual_seed(0)
     vertices = scene["vertices"].clone().requires_grad_()
     fused = picture(scene, vertices=vertices)

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from threading import Lock
 from typing import ClassVar
 
 import numpy as np
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from render.antialias import DEPTH_MARGIN, edges_of, neighbours_of
 from render.kernels import cpu
+from render.kernels.announce import announced
 from render.rasterize import NEAR
 
 CORES = os.cpu_count() or 1
@@ -240,11 +242,16 @@ def tile_count(batch: int, height: int) -> int:
 
 
 _pool: ThreadPoolExecutor | None = None
+_compiling = Lock()
 
 
 def spread(kernel, pieces: int, *arguments) -> None:
     """Run `kernel(worker, first, last, *arguments)` over all pieces on as many threads as torch uses."""
     threads = min(_worker_count(), pieces)
+    if not kernel.signatures:
+        with _compiling, announced():
+            kernel(0, 0, pieces, *arguments)  # compiles once, not in every thread
+        return
     if threads <= 1:
         kernel(0, 0, pieces, *arguments)
         return
@@ -260,8 +267,6 @@ def spread(kernel, pieces: int, *arguments) -> None:
                 return
             kernel(worker, first, last, *arguments)
 
-    if not kernel.signatures:
-        kernel(0, *parts.popleft(), *arguments)  # compiles once, not in every thread
     helpers = [_workers().submit(work, worker) for worker in range(1, threads)]
     work(0)
     for helper in helpers:
