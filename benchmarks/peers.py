@@ -1,9 +1,8 @@
 """How fast other renderers draw the same heads: the mesh, view and light of `renderer.py`, new vertices in each frame.
 
-    python benchmarks/peers.py [--json FILE] [--scenes 10k/128 41k/128 10k/512] [--repeats N]
-
-A peer that is not installed, or cannot start, is reported in one sentence. Each runs in a process of its own, since
-some abort where a library does not suit them. What differs between them, and from `render`:
+`renderer.py` runs them beside ours. A peer that is not installed, or cannot start, is reported in one sentence. Each
+runs in a process of its own, since some abort where a library does not suit them. What differs between them, and from
+`render`:
 
     moderngl     OpenGL by EGL (without a GPU: llvmpipe), shaders of `render.opengl`, 8 bits; no antialiasing
     pyrender     the same by pyrender (PYOPENGL_PLATFORM, else OSMesa, else EGL)
@@ -20,9 +19,7 @@ from their sources.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
-import json
 import math
 import multiprocessing
 import os
@@ -441,42 +438,3 @@ def _fill(geometry, points, faces):
         scale = 1 / np.sqrt(squared) if squared > 0 else 0.0
         for axis in range(3, 6):
             geometry[vertex, axis] *= scale
-
-
-def main() -> None:
-    from renderer import FREQUENCIES, Head, time_ms
-
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--json", type=Path, help="write the numbers there")
-    parser.add_argument("--scenes", nargs="+", default=["10k/128", "41k/128", "10k/512"], help="vertices/pixels")
-    parser.add_argument("--repeats", type=int, default=9, help="calls of which the median counts")
-    arguments = parser.parse_args()
-    results = {"threads": torch.get_num_threads(), "ours": {}, "peers": {}}
-    for scene in arguments.scenes:
-        size, pixels = scene.split("/")
-        head = Head(FREQUENCIES[size])
-        ours = dict(zip(("forward_ms", "forward_backward_ms"), time_ms(head, int(pixels))))
-        peers = measure_peers(head, int(pixels), arguments.repeats)
-        results["ours"][scene], results["peers"][scene] = ours, peers
-        print(f"{scene}: milliseconds a frame (times ours)")
-        for name, numbers in {"ours": ours, **peers}.items():
-            print(f"  {name:20s}{_row(numbers, ours)}", flush=True)
-    if arguments.json:
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
-
-
-def _row(numbers: dict[str, float] | str, ours: dict[str, float]) -> str:
-    if isinstance(numbers, str):
-        return numbers
-    cells = []
-    for key, label in (("forward_ms", "forward"), ("forward_backward_ms", "forward + backward")):
-        if key in numbers:
-            cells.append(f"{label} {numbers[key]:8.3f} ({numbers[key] / ours[key]:7.1f})")
-    if "difference" in numbers:
-        cells.append(f"differs by {numbers['difference'] * 255:.4f} / 255")
-    return "  ".join(cells)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,11 +1,20 @@
-"""How fast the renderer is, and how true its gradients are.
+"""How fast the renderer is beside its peers, and how true its gradients are.
 
-A head-like geodesic mesh with 52 blendshapes, vertex colours and a point light; 16 expressions in a batch. Prints two
-tables; `--json FILE` writes `ours["10k/128"].forward_ms` and `.forward_backward_ms` (medians, milliseconds a frame) and
-`gradient["10k"].cosine` and `.relative_error`: the gradient of a smooth picture loss for the weights, against central
-differences of a picture made from 8 x 8 samples a pixel.
+A head-like geodesic mesh with 52 blendshapes, vertex colours and a point light; 16 expressions in a batch. `--json
+FILE` writes what the tables say:
 
-    python benchmarks/renderer.py [--json FILE] [--sizes 5k 10k 26k] [--pixels 64 128 256] [--threads N]
+    ours["10k/128"].forward_ms, .forward_backward_ms    medians, milliseconds a frame
+    slopes.vertices, .pixels, .batch                    exponents: 1 is twice the time for twice as many
+    peers["10k/128"].NAME                               the same numbers of others, or a sentence why there are none
+    gradient["10k"].cosine, .relative_error             of 52 weights, 128 pixels; "10k/64" and so on for other sizes
+    gradient["camera"], ["light"], ["texture"]          5k vertices, 128 pixels
+    face["eyes + lips x4"]                              anny:man, drawn 1, 2, 4 times as large and averaged
+
+A gradient of a smooth picture loss is held against central differences of a picture made from 8 x 8 samples a pixel;
+means over `--seeds` expressions.
+
+    python benchmarks/renderer.py [--json FILE] [--sizes 5k 10k 26k] [--pixels 64 128 256] [--threads N] [--seeds N]
+                                  [--skip speed|peers|gradient|face ...]
 """
 
 from __future__ import annotations
@@ -17,6 +26,7 @@ import os
 import statistics
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch starts: its idle threads would spin on our cores
@@ -112,39 +122,158 @@ class Head:
         return srgb_from_linear(torch.nn.functional.avg_pool2d(linear_from_srgb(fine), samples))
 
 
+def supersampled(picture: Tensor, samples: int) -> Tensor:
+    """The mean light of samples x samples points of an sRGB picture (B, 3, H, W) as one, in sRGB."""
+    return srgb_from_linear(torch.nn.functional.avg_pool2d(linear_from_srgb(picture), samples))
+
+
+def agreement(analytic: Tensor, numeric: Tensor) -> dict[str, float]:
+    """Cosine and relative error of a gradient against another, both flat."""
+    cosine = torch.nn.functional.cosine_similarity(analytic, numeric, dim=0).item()
+    return {"cosine": cosine, "relative_error": ((analytic - numeric).norm() / numeric.norm()).item()}
+
+
+def compare(
+    draw: Callable[[Tensor, int], Tensor],
+    point: Tensor,
+    steps: Tensor,
+    target: Tensor,
+    pixels: int,
+    samples: int = 8,
+    internal: int = 1,
+    region: Tensor | None = None,
+) -> dict[str, float]:
+    """Cosine and relative error of the gradient of a smooth loss, against central differences.
+
+    Args:
+        draw: Numbers (N,) and a size in pixels -> sRGB picture (1, 3, size, size).
+        point: Where the gradient is taken, (N,).
+        steps: Of the differences, one for each number; numbers with a step of 0 are left out.
+        target: Numbers that make the picture from which the loss counts.
+        pixels: Height and width of the pictures that are compared.
+        samples: Of the picture for the differences, along each side of a pixel.
+        internal: The same of the picture that is differentiated.
+        region: Where the loss counts, (pixels, pixels).
+    """
+    goal = _smooth(supersampled(draw(target, pixels * samples), samples))
+    counts = 1.0 if region is None else region[4:-4, 4:-4]
+
+    def loss(numbers: Tensor, factor: int) -> Tensor:
+        picture = draw(numbers, pixels * factor)
+        return (counts * (_smooth(supersampled(picture, factor) if factor > 1 else picture) - goal) ** 2).sum()
+
+    leaf = point.clone().requires_grad_()
+    (analytic,) = torch.autograd.grad(loss(leaf, internal), leaf)
+    moved = steps.nonzero()[:, 0]
+    numeric = torch.zeros(len(moved))
+    with torch.no_grad():
+        for place, n in enumerate(moved.tolist()):
+            offset = torch.zeros_like(point)
+            offset[n] = steps[n]
+            after, before = (loss(point + sign * offset, samples) for sign in (1, -1))
+            numeric[place] = (after - before) / (2 * steps[n])
+    scale = steps[moved]  # numbers of different units count by what a step of each does
+    return agreement(analytic[moved] * scale, numeric * scale)
+
+
 def gradient_accuracy(
     head: Head, pixels: int, step: float = 0.02, seed: int = 1, shapes: int = 52, samples: int = 8
 ) -> tuple[float, float]:
     """Cosine and relative error of the gradient for the weights of a smooth loss, against central differences."""
+    point, target = _expressions(seed)
+    steps = torch.where(torch.arange(52) < shapes, step, 0.0)
+    found = compare(lambda w, size: head.render(w[None], size)["color"], point, steps, target, pixels, samples)
+    return found["cosine"], found["relative_error"]
+
+
+def _expressions(seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
-    draw = torch.rand(2, 52, generator=generator) * (torch.rand(2, 52, generator=generator) < 0.3)
-    draw = draw.to(head.neutral.dtype)
-    target = _smooth(head.render_supersampled(draw[1:], pixels, samples))
+    return torch.rand(2, 52, generator=generator) * (torch.rand(2, 52, generator=generator) < 0.3)
 
-    def loss(picture: Tensor) -> Tensor:
-        return ((_smooth(picture) - target) ** 2).flatten(1).sum(1)
 
-    weights = draw[:1].clone().requires_grad_()
-    loss(head.render(weights, pixels)["color"]).sum().backward()
-    analytic = weights.grad[0, :shapes]
-    numeric = torch.zeros_like(analytic)
-    for k in range(shapes):
-        offset = torch.nn.functional.one_hot(torch.tensor(k), 52) * step
-        after, before = (loss(head.render_supersampled(draw[:1] + sign * offset, pixels, samples)) for sign in (1, -1))
-        numeric[k] = (after - before).item() / (2 * step)
-    cosine = torch.nn.functional.cosine_similarity(analytic, numeric, dim=0).item()
-    return cosine, ((analytic - numeric).norm() / numeric.norm()).item()
+def scene_accuracy(head: Head, pixels: int, kind: str, seed: int) -> dict[str, float]:
+    """The same for camera (matrix and focal length), light (position and coefficients) or 12 places of a texture."""
+    generator = torch.Generator().manual_seed(seed)
+    vertices = head.vertices(_expressions(seed)[:1])
+    camera, light = head.camera, head.light
+    arguments = {"colors": head.colors, "background": (0.2, 0.25, 0.35)}
+    if kind == "camera":
+        point = torch.cat([camera.world_to_camera.flatten(), torch.tensor([camera.focal])])
+        # About a tenth of a pixel each: rotation and shear act at 0.1 m from the middle, distances at 0.8 m.
+        steps = torch.tensor([0.002, 0.002, 0.002, 0.0002] * 2 + [0.002, 0.002, 0.002, 0.001] + [0.01])
+
+        def draw(numbers: Tensor, size: int) -> Tensor:
+            moved = Camera(numbers[:12].view(3, 4), numbers[12])
+            return render(vertices, head.faces, moved, light, height=size, width=size, **arguments)["color"]
+    elif kind == "light":
+        point = torch.cat([light.position, light.coefficients])
+        steps = torch.tensor([0.02, 0.02, 0.02, 0.01, 0.01, 0.01, 0.5])
+
+        def draw(numbers: Tensor, size: int) -> Tensor:
+            lit = Light(numbers[:3], *numbers[3:])
+            return render(vertices, head.faces, camera, lit, height=size, width=size, **arguments)["color"]
+    else:
+        # White noise for each texel, which is what a renderer without mip maps draws wrong; brighter in round places.
+        x, y, _ = torch.nn.functional.normalize(head.neutral, dim=-1).unbind(-1)
+        arguments = {"uv": torch.stack([0.5 + 0.45 * x, 0.5 - 0.45 * y], -1), "background": (0.2, 0.25, 0.35)}
+        noise = 0.2 + 0.5 * torch.rand(512, 512, 3, generator=generator)
+        rows, columns = torch.meshgrid(torch.linspace(0, 1, 512), torch.linspace(0, 1, 512), indexing="ij")
+        centres = 0.25 + 0.5 * torch.rand(12, 2, generator=generator)
+        spots = torch.exp(-((rows - centres[:, :1, None]) ** 2 + (columns - centres[:, 1:, None]) ** 2) / 0.05**2)
+        point, steps = torch.zeros(12), torch.full((12,), 0.05)
+
+        def draw(numbers: Tensor, size: int) -> Tensor:
+            texture = noise + (numbers[:, None, None] * spots).sum(0)[..., None]
+            return render(
+                vertices, head.faces, camera, light, height=size, width=size, texture=texture, **arguments
+            )["color"]  # fmt: skip
+
+    change = torch.randn(len(point), generator=generator).clamp(-2, 2)
+    return compare(draw, point, steps, point + 3 * steps * change, pixels)
+
+
+def face_accuracy(pixels: int, internal: int, region: str, seed: int) -> dict[str, float]:
+    """The same for the weights of anny:man, over the whole picture or within boxes around the eyes and the lips."""
+    from reenact.portrait import Portrait
+    from reenact.rigs import anny, motion
+
+    rig = anny.build("anny:man")
+    portrait = Portrait.of(rig)
+    point, target = motion.expressions(rig.names, 2, seed)
+    mask = None
+    if region == "eyes + lips":
+        mask = torch.zeros(pixels, pixels)
+        places = portrait.project(rig.vertices(point[None])[0], pixels)
+        for part in region.split(" + "):
+            corners = places[rig.part(part)]
+            left, top = (corners.amin(0) - pixels / 64).floor().int().tolist()
+            right, bottom = (corners.amax(0) + pixels / 64).ceil().int().tolist()
+            mask[top:bottom, left:right] = 1
+    return compare(
+        lambda w, size: portrait.render(rig.vertices(w[None]), size)["color"], point, torch.full_like(point, 0.02),
+        target, pixels, internal=internal, region=mask,
+    )  # fmt: skip
+
+
+def _mean(found: list[dict[str, float]]) -> dict[str, float]:
+    """Means over seeds, and the worst."""
+    means = {key: statistics.mean(each[key] for each in found) for key in found[0]}
+    return {
+        **means,
+        "worst_cosine": min(each["cosine"] for each in found),
+        "worst_relative_error": max(each["relative_error"] for each in found),
+    }
 
 
 def _smooth(picture: Tensor) -> Tensor:
     return torch.nn.functional.avg_pool2d(torch.nn.functional.avg_pool2d(picture, 5, 1), 5, 1)
 
 
-def time_ms(head: Head, pixels: int, repeats: int = 15) -> tuple[float, float]:
-    """Median milliseconds a frame, forward and forward + backward to the vertices, batch of 16."""
-    weights = torch.rand(BATCH, 52, generator=torch.Generator().manual_seed(0)) * 0.5
+def time_ms(head: Head, pixels: int, repeats: int = 15, batch: int = BATCH) -> tuple[float, float]:
+    """Median milliseconds a frame, forward and forward + backward to the vertices."""
+    weights = torch.rand(batch, 52, generator=torch.Generator().manual_seed(0)) * 0.5
     vertices = head.vertices(weights)
-    picture_gradient = torch.randn(BATCH, 3, pixels, pixels, generator=torch.Generator().manual_seed(0))
+    picture_gradient = torch.randn(batch, 3, pixels, pixels, generator=torch.Generator().manual_seed(0))
     forward, both = [], []
     for repeat in range(repeats + 2):
         vertices = vertices.detach().requires_grad_()
@@ -157,35 +286,138 @@ def time_ms(head: Head, pixels: int, repeats: int = 15) -> tuple[float, float]:
         if repeat >= 2:
             forward.append(middle - start)
             both.append(time.perf_counter() - start)
-    return tuple(statistics.median(times) * 1000 / BATCH for times in (forward, both))
+    return tuple(statistics.median(times) * 1000 / batch for times in (forward, both))
+
+
+def slope(sizes: list[float], times: list[float]) -> float:
+    """Exponent of the power law nearest to the times."""
+    x, y = torch.tensor(sizes).log(), torch.tensor(times).log()
+    return ((x - x.mean()) * (y - y.mean())).sum().item() / ((x - x.mean()) ** 2).sum().item()
+
+
+def measure_speed(sizes: list[str], pixels: list[int]) -> dict:
+    """`ours` and `slopes` of the JSON file."""
+    ours = {}
+    print("size / pixels   forward  forward + backward  (ms a frame)")
+    for size in sizes:
+        head = Head(FREQUENCIES[size])
+        for each in pixels:
+            forward, both = time_ms(head, each)
+            ours[f"{size}/{each}"] = {"forward_ms": forward, "forward_backward_ms": both}
+            print(f"{size + ' / ' + str(each):15s} {forward:7.3f}  {both:18.3f}", flush=True)
+    slopes = {}
+    by_vertices = {10 * n * n + 2: time_ms(Head(n), 128) for n in FREQUENCIES.values()}
+    by_pixels = {each**2: time_ms(Head(FREQUENCIES["10k"]), each) for each in (64, 128, 256, 512)}
+    by_batch = {
+        each: [each * ms for ms in time_ms(Head(FREQUENCIES["10k"]), 128, batch=each)] for each in (1, 2, 4, 8, 16, 32)
+    }
+    for name, times in (("vertices", by_vertices), ("pixels", by_pixels), ("batch", by_batch)):
+        keys = [float(key) for key in times]
+        slopes[name] = {
+            which: slope(keys, [pair[n] for pair in times.values()])
+            for n, which in enumerate(("forward", "forward_backward"))
+        }
+        slopes[name]["ms"] = {str(key): list(pair) for key, pair in times.items()}
+        print(
+            f"{name:10s} time ~ n^{slopes[name]['forward']:.2f} forward, n^{slopes[name]['forward_backward']:.2f} both"
+        )
+    return {"ours": ours, "slopes": slopes}
+
+
+def measure_beside_peers(scenes: list[str]) -> dict:
+    """`peers` of the JSON file, and ours in the same minute."""
+    from peers import measure_peers
+
+    results: dict = {}
+    for scene in scenes:
+        size, pixels = scene.split("/")
+        head = Head(FREQUENCIES[size])
+        ours = dict(zip(("forward_ms", "forward_backward_ms"), time_ms(head, int(pixels))))
+        results[scene] = {"ours": ours, **measure_peers(head, int(pixels))}
+        print(f"{scene}: milliseconds a frame (times ours)")
+        for name, numbers in results[scene].items():
+            print(f"  {name:20s}{_row(numbers, ours)}", flush=True)
+    return {"peers": results}
+
+
+def _row(numbers: dict[str, float] | str, ours: dict[str, float]) -> str:
+    if isinstance(numbers, str):
+        return numbers
+    cells = []
+    for key, label in (("forward_ms", "forward"), ("forward_backward_ms", "forward + backward")):
+        if key in numbers:
+            cells.append(f"{label} {numbers[key]:8.3f} ({numbers[key] / ours[key]:7.1f})")
+    if "difference" in numbers:
+        cells.append(f"differs by {numbers['difference'] * 255:.4f} / 255")
+    return "  ".join(cells)
+
+
+def measure_gradients(sizes: list[str], pixels: list[int], seeds: int) -> dict:
+    """`gradient` of the JSON file."""
+    gradient = {}
+    print(f"gradient against differences of 8 x 8 samples a pixel, {seeds} seeds")
+    for size in sizes:
+        head = Head(FREQUENCIES[size])
+        for each in pixels:
+            found = [gradient_accuracy(head, each, seed=seed) for seed in range(1, seeds + 1)]
+            numbers = _mean([{"cosine": cosine, "relative_error": error} for cosine, error in found])
+            gradient[f"{size}/{each}"] = numbers
+            if each == 128:
+                gradient[size] = numbers
+            _say(f"weights {size}/{each}", numbers)
+    for kind in ("camera", "light", "texture"):
+        head = Head(FREQUENCIES["5k"])
+        gradient[kind] = _mean([scene_accuracy(head, 128, kind, seed) for seed in range(1, seeds + 1)])
+        _say(f"{kind} 5k/128", gradient[kind])
+    return {"gradient": gradient}
+
+
+def measure_face(seeds: int) -> dict:
+    """`face` of the JSON file."""
+    face = {}
+    for region in ("all", "eyes + lips"):
+        for internal in (1, 2, 4):
+            name = f"{region} x{internal}"
+            face[name] = _mean([face_accuracy(128, internal, region, seed) for seed in range(1, seeds + 1)])
+            _say(f"anny:man {name}", face[name])
+    return {"face": face}
+
+
+def _say(name: str, numbers: dict[str, float]) -> None:
+    print(
+        f"{name:26s} cosine {numbers['cosine']:.4f} (worst {numbers['worst_cosine']:.4f})  relative error "
+        f"{numbers['relative_error']:.3f} (worst {numbers['worst_relative_error']:.3f})",
+        flush=True,
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--json", type=Path, help="write the numbers there")
-    parser.add_argument("--sizes", nargs="+", choices=FREQUENCIES, default=["5k", "10k", "26k"])
+    parser.add_argument("--sizes", nargs="+", choices=FREQUENCIES, default=["5k", "10k", "26k", "41k"])
     parser.add_argument("--pixels", nargs="+", type=int, default=[64, 128, 256])
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument(
+        "--seeds", type=int, default=1, help="expressions over which the gradients' errors are averaged"
+    )
+    parser.add_argument("--skip", nargs="+", choices=["speed", "peers", "gradient", "face"], default=[])
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    results = {"threads": arguments.threads, "batch": BATCH, "ours": {}, "gradient": {}}
-    heads = {size: Head(FREQUENCIES[size]) for size in arguments.sizes}
+    results: dict = {"threads": arguments.threads, "batch": BATCH}
     start = time.perf_counter()
-    first = next(iter(heads.values()))
-    first.render(torch.zeros(1, 52, requires_grad=True), 16)["color"].sum().backward()
+    Head(8).render(torch.zeros(2, 52, requires_grad=True), 16)["color"].sum().backward()
     results["first_call_s"] = time.perf_counter() - start
     print(f"{arguments.threads} threads, batch {BATCH}; first call {results['first_call_s']:.1f} s")
-    print("size / pixels   forward  forward + backward  (ms a frame)")
-    for size, head in heads.items():
-        for pixels in arguments.pixels:
-            forward, both = time_ms(head, pixels)
-            results["ours"][f"{size}/{pixels}"] = {"forward_ms": forward, "forward_backward_ms": both}
-            print(f"{size + ' / ' + str(pixels):15s} {forward:7.3f}  {both:18.3f}", flush=True)
-    print("gradient for 52 weights against 8 x 8 supersampled differences, 128 pixels")
-    for size, head in heads.items():
-        cosine, error = gradient_accuracy(head, 128)
-        results["gradient"][size] = {"cosine": cosine, "relative_error": error}
-        print(f"{size:15s} cosine {cosine:.4f}  relative error {error:.3f}", flush=True)
+    if "speed" not in arguments.skip:
+        results |= measure_speed(arguments.sizes, arguments.pixels)
+    if "peers" not in arguments.skip:
+        results |= measure_beside_peers(["10k/128", "41k/128", "10k/512"])
+    if "gradient" not in arguments.skip:
+        results |= measure_gradients(
+            [size for size in arguments.sizes if size != "41k"], arguments.pixels, arguments.seeds
+        )
+    if "face" not in arguments.skip:
+        results |= measure_face(arguments.seeds)
     if arguments.json:
         arguments.json.parent.mkdir(parents=True, exist_ok=True)
         arguments.json.write_text(json.dumps(results, indent=2) + "\n")

@@ -31,8 +31,8 @@ from render.rasterize import front_faces
 
 DEPTH_MARGIN = 1e-4
 """An edge is in front of a pixel's surface if its inverse depth is larger by this share."""
-VALLEY = 2e-4
-"""Two sheets are looked for where the slope of the inverse depth rises by this share of it from pixel to pixel."""
+VALLEY = 0.27
+"""Two sheets are looked for where the surface has a groove of at least this angle: 15 degrees, seen from the front."""
 WALK = 24
 """Faces that a walk over a sheet crosses at most."""
 
@@ -49,8 +49,6 @@ class Outline:
     """Vertices of the edge, in the order in which pixel rows (columns) meet them."""
     face: int
     """The edge's front face."""
-    share: float
-    """1, or 0.5 where both rows and columns look for this edge."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +63,6 @@ class Meeting:
     """The face seen there, and the face of the other sheet below it."""
     at_behind: tuple[int, int]
     """The face seen there, and the face of the other sheet below it."""
-    share: float
-    """1, or 0.5 where both rows and columns look for this place."""
 
 
 Crossing = Outline | Meeting
@@ -74,12 +70,15 @@ Crossing = Outline | Meeting
 
 @torch.no_grad()
 def find_crossings(
-    face_img: Int[Tensor, "B H W"], vertices_clip: Float[Tensor, "B V 4"], faces: Int[Tensor, "F 3"]
+    face_img: Int[Tensor, "B H W"],
+    vertices_clip: Float[Tensor, "B V 4"],
+    faces: Int[Tensor, "F 3"],
+    focal: float,
 ) -> list[list[Crossing]]:
     """Of each frame, where something else begins between two pixels; like visibility it has no gradient.
 
-    At most one crossing for each pair of neighbouring pixels: of several outlines of one side the outermost, and a
-    meeting rather than an outline.
+    At most one crossing for each pair of neighbouring pixels: of several outlines the outermost (they all belong to the
+    pixel that is nearer), and a meeting rather than an outline. The focal length is in pixels.
     """
     height, width = face_img.shape[1:]
     pixels = to_pixels(vertices_clip, height, width)
@@ -87,9 +86,9 @@ def find_crossings(
     edges = edges_of(faces)
     neighbours = neighbours_of(faces, edges).tolist()
     return [
-        _Frame(face_img[b], pixels[b], 1 / vertices_clip[b, :, 3], faces, front[b].tolist(), neighbours).crossings(
-            edges.tolist()
-        )
+        _Frame(
+            face_img[b], pixels[b], 1 / vertices_clip[b, :, 3], faces, front[b].tolist(), neighbours, VALLEY / focal
+        ).crossings(edges.tolist())
         for b in range(len(face_img))
     ]
 
@@ -97,9 +96,9 @@ def find_crossings(
 class _Frame:
     """One frame, and the questions about it."""
 
-    def __init__(self, face_img, pixels, inverse, faces, front, neighbours) -> None:
+    def __init__(self, face_img, pixels, inverse, faces, front, neighbours, valley) -> None:
         self.face_img, self.pixels, self.inverse, self.faces = face_img, pixels, inverse, faces
-        self.front, self.neighbours = front, neighbours
+        self.front, self.neighbours, self.valley = front, neighbours, valley
         self.height, self.width = face_img.shape
         self.inverse_img = torch.zeros(self.height, self.width).to(inverse)
         for row, column in (face_img >= 0).nonzero().tolist():
@@ -125,19 +124,11 @@ class _Frame:
         for p, q, *sides in edges:
             fronts = [face for face in sides if face >= 0 and self.front[face]]
             if len(fronts) == 1:
-                for along in range(2):
-                    for pair, distance, crossing in self._along_edge(p, q, fronts[0], along):
-                        known = found.get(pair)
-                        if (
-                            known is None
-                            or isinstance(crossing, Meeting)
-                            or (
-                                isinstance(known[1], Outline)
-                                and known[1].surface == crossing.surface
-                                and distance > known[0]
-                            )
-                        ):
-                            found[pair] = distance, crossing
+                for pair, distance, crossing in self._along_edge(p, q, fronts[0]):
+                    known = found.get(pair)
+                    outermost = known is None or (isinstance(known[1], Outline) and distance > known[0])
+                    if outermost or isinstance(crossing, Meeting):
+                        found[pair] = distance, crossing
         for along in range(2):
             for row in range(self.height - along):
                 for column in range(self.width - 1 + along):
@@ -146,21 +137,22 @@ class _Frame:
                         found[meeting.surface, meeting.behind] = 0.0, meeting
         return [crossing for _, crossing in found.values()]
 
-    def _along_edge(self, p: int, q: int, face: int, along: int):
+    def _along_edge(self, p: int, q: int, face: int):
         """Pair, distance from the surface's centre, and crossing wherever an edge separates two pixels.
 
-        Rows (along == 0) meet a steep edge, columns a shallow one, both with half the share one in between. Below, "t"
-        is the column (row) where row (column) "s" meets the edge.
+        Rows (along == 0) meet a steep edge, columns a shallow one. Below, "t" is the column (row) where row (column)
+        "s" meets the edge.
         """
-        pixels, across = self.pixels, 1 - along
+        pixels = self.pixels
+        x, y = (pixels[q] - pixels[p]).abs().tolist()
+        along, across = (0, 1) if y > x else (1, 0)
         o = int(self.faces[face].sum()) - p - q
         if not pixels[p, across] < pixels[q, across]:
             p, q = q, p
         s0, s1, t0, t1 = (float(pixels[v, axis]) for axis in (across, along) for v in (p, q))
-        reach, drift = s1 - s0, abs(t1 - t0)
-        if not 2 * reach > drift:
+        reach = s1 - s0
+        if not reach > 0:
             return
-        share = 1.0 if reach >= 2 * drift else 0.5
         before = float(pixels[o, along]) < t0 + (t1 - t0) / reach * (float(pixels[o, across]) - s0)
         last_s, last_t = (self.height - 1, self.width - 1) if along == 0 else (self.width - 1, self.height - 1)
         # Without s1: the next edge of the outline takes it.
@@ -187,7 +179,7 @@ class _Frame:
                         yield (first, second), 0.0, meeting
                     continue
             distance = t - cell if before else 1 - (t - cell)
-            yield (first, second), distance, Outline(surface, behind, (p, q), face, share)
+            yield (first, second), distance, Outline(surface, behind, (p, q), face)
 
     def _between(self, row: int, column: int, along: int) -> Meeting | None:
         """Two sheets that both reach under both pixels."""
@@ -198,7 +190,9 @@ class _Frame:
         beyond = min(second[0] + step[0], self.height - 1), min(second[1] + step[1], self.width - 1)
         rise = max(self.inverse_img[ahead] - 2 * a + b, a - 2 * b + self.inverse_img[beyond])
         face, other = int(self.face_img[first]), int(self.face_img[second])
-        if not (a > 0 and b > 0 and rise > VALLEY * a) or face == other:
+        if not (a > 0 and b > 0 and rise > self.valley * a):
+            return None
+        if set(self.faces[face].tolist()) & set(self.faces[other].tolist()):
             return None
         below_second = self.walk(face, second[1], second[0])
         if below_second < 0 or below_second == other:
@@ -222,10 +216,8 @@ class _Frame:
                 self.depth_of(face, x, y) - self.depth_of(face, column, row) for face in (at_first[0], at_second[0])
             ]
             slopes.append(float(abs(rises[0] - rises[1])))
-        reach, drift = slopes if first[0] == second[0] else slopes[::-1]
-        if not 2 * reach > drift:
-            return None
-        return Meeting(first, second, at_first, at_second, 1.0 if reach >= 2 * drift else 0.5)
+        is_in_row = first[0] == second[0]
+        return Meeting(first, second, at_first, at_second) if is_in_row == (slopes[0] > slopes[1]) else None
 
 
 def distances(
@@ -315,7 +307,7 @@ def blend(
             }
         for (row, column), change in changes.items():
             place = torch.tensor(row), torch.tensor(column)
-            blended = blended.index_put(place, crossing.share * change, accumulate=True)
+            blended = blended.index_put(place, change, accumulate=True)
     return blended
 
 

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from itertools import accumulate
+from types import ModuleType
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -16,8 +17,7 @@ from torch import Tensor
 from render.antialias import Meeting, blend, distances, edge_points, find_crossings
 from render.camera import Camera
 from render.interpolate import barycentrics, interpolate
-from render.kernels.cpu import Mesh
-from render.kernels.function import Fused, Scene, topology
+from render.kernels import function
 from render.rasterize import rasterize
 from render.shade import (
     Light,
@@ -54,8 +54,10 @@ def render(
 ) -> dict[str, Tensor]:
     """Pictures of a batch of deformed copies of one mesh, from the outside: back faces are not drawn.
 
+    On a GPU where the vertices are on one; camera and light may be elsewhere.
+
     Args:
-        vertices: World space, metres; float32 or float64.
+        vertices: World space, metres; float32, or float64 on the CPU.
         faces: Triangles, counter-clockwise from outside.
         camera: Sees all copies.
         light: Lights all copies.
@@ -82,41 +84,47 @@ def render(
         light position, colours, texture and attributes from all but parts; which triangle is seen has none.
 
     Raises:
-        ValueError: A vertex is not finite, a face names a missing vertex, a buffer is unknown, a size or count
-            disagrees.
+        ValueError: A vertex is not finite, a face names a missing vertex, a buffer is unknown, a size, count or
+            device disagrees, or Warp is missing for the GPU.
     """
     _check(vertices, faces, height, width, colors, texture, uv, uv_faces, parts, attributes, background, buffers)
-    dtype = vertices.dtype
-    number = np.float64 if dtype == torch.float64 else np.float32
-    topology_arrays = topology(faces, vertices.shape[1])
+    dtype, device = vertices.dtype, vertices.device
+    kernels = _kernels_for(device, dtype)
+    array = kernels.array
+    topology = kernels.topology(faces, vertices.shape[1])
     if texture is None:
-        texels, levels = torch.zeros(0, 3, dtype=dtype), np.zeros((0, 3), np.int64)
-        uv_arrays = np.zeros((0, 2), number), np.zeros((0, 3), np.int32), np.zeros(0, number)
+        texels, levels = vertices.new_zeros(0, 3), array(faces.new_zeros(0, 3), torch.int64)
+        none = vertices.new_zeros(0)
+        uv_arrays = array(none.view(0, 2), dtype), array(faces[:0], torch.int32), array(none, dtype)
     else:
         rows, columns, corners = *texture.shape[:2], faces if uv_faces is None else uv_faces
-        texels, levels = _remembered(_texels, texture, dtype=dtype)
-        uv_arrays = _remembered(_texture_arrays, uv, corners, rows=rows, columns=columns, dtype=dtype)
-    scene = Scene(
-        mesh=Mesh(*topology_arrays, *uv_arrays, levels),
+        texels, levels = _remembered(_texels, texture, dtype=dtype, array=array)
+        uv_arrays = _remembered(_texture_arrays, uv, corners, rows=rows, columns=columns, dtype=dtype, array=array)
+    scene = function.Scene(
+        mesh=kernels.Mesh(*topology, *uv_arrays, levels),
         axis=((width - 1) / 2, (height - 1) / 2),
-        background=linear_from_srgb(torch.tensor(list(background), dtype=dtype)).numpy(),
+        background=array(linear_from_srgb(torch.tensor(list(background), dtype=dtype)).to(device), dtype),
         height=height,
         width=width,
-        parts=np.ascontiguousarray(parts.numpy(), dtype=np.int64) if "parts" in buffers else None,
+        parts=array(parts, torch.int64) if "parts" in buffers else None,
         with_normals="normals" in buffers,
         with_depth="depth" in buffers,
     )
     if "attributes" not in buffers:
         attributes = vertices.new_zeros(len(vertices), 0, 0)
-    color, mask, extras, inverse_depth, part_img = Fused.apply(
+    if colors is None:
+        linear_colors = vertices.new_ones(vertices.shape[1], 3)
+    else:
+        linear_colors = _remembered(_linear, colors, dtype=dtype)
+    color, mask, extras, inverse_depth, part_img = kernels.Fused.apply(
         vertices,
-        camera.world_to_camera.to(dtype),
-        torch.as_tensor(camera.focal, dtype=dtype) * (height / 2),
-        torch.ones(vertices.shape[1], 3, dtype=dtype) if colors is None else _remembered(_linear, colors, dtype=dtype),
+        camera.world_to_camera.to(vertices),
+        torch.as_tensor(camera.focal, dtype=dtype, device=device) * (height / 2),
+        linear_colors,
         texels,
         attributes.to(dtype),
-        camera.to_camera(light.position.to(dtype)),
-        light.coefficients.to(dtype),
+        camera.to_camera(light.position.to(vertices)),
+        light.coefficients.to(vertices),
         scene,
     )
     normals = 3 if "normals" in buffers else 0
@@ -128,12 +136,29 @@ def render(
     return {name: made[name] for name in buffers}
 
 
+def _kernels_for(device: torch.device, dtype: torch.dtype) -> ModuleType:
+    """The module of compiled stages for vertices of this kind."""
+    if device.type == "cpu":
+        return function
+    if device.type != "cuda":
+        raise ValueError(f"vertices: expected them on the CPU or on a CUDA device, got {device}; move them with .to()")
+    if dtype != torch.float32:
+        raise ValueError(f"vertices: expected float32 on a GPU, got {dtype}; pass vertices.float()")
+    try:
+        from render.kernels import cuda  # slow to import
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            f"vertices: expected Warp to render on {device}, got no module {error.name!r}; pip install warp-lang"
+        ) from error
+    return cuda
+
+
 _known: OrderedDict[tuple, tuple[tuple[Tensor, ...], tuple[int, ...], object]] = OrderedDict()
 
 
 def _remembered(function: Callable, *tensors: Tensor, **settings):
     """`function` of tensors that are the same in each call, such as a rig's colours; computed once for the last few."""
-    if any(tensor.requires_grad for tensor in tensors):
+    if any(tensor.requires_grad or tensor.is_inference() for tensor in tensors):
         return function(*tensors, **settings)
     key = (function, *map(id, tensors), *settings.values())
     versions = tuple(tensor._version for tensor in tensors)  # counts changes in place
@@ -150,19 +175,21 @@ def _linear(srgb: Tensor, dtype: torch.dtype) -> Tensor:
     return linear_from_srgb(srgb.to(dtype))
 
 
-def _texels(texture: Tensor, dtype: torch.dtype) -> tuple[Tensor, np.ndarray]:
+def _texels(texture: Tensor, dtype: torch.dtype, array: Callable) -> tuple:
     """All levels of an sRGB texture in one row of linear texels; first texel, rows and columns of each level."""
     levels = mip_maps(linear_from_srgb(texture.to(dtype)))
     sizes = [tuple(level.shape[:2]) for level in levels]
-    starts = np.cumsum([0, *(rows * columns for rows, columns in sizes[:-1])])
-    table = np.array([(start, rows, columns) for start, (rows, columns) in zip(starts, sizes)], np.int64)
-    return torch.cat([level.flatten(0, 1) for level in levels]), table
+    starts = accumulate((rows * columns for rows, columns in sizes), initial=0)
+    table = torch.tensor([(start, *size) for start, size in zip(starts, sizes)], device=texture.device)
+    return torch.cat([level.flatten(0, 1) for level in levels]), array(table, torch.int64)
 
 
-def _texture_arrays(uv: Tensor, uv_faces: Tensor, rows: int, columns: int, dtype: torch.dtype) -> tuple:
+def _texture_arrays(
+    uv: Tensor, uv_faces: Tensor, rows: int, columns: int, dtype: torch.dtype, array: Callable
+) -> tuple:
     uv = uv.detach().to(dtype)
     areas = texel_areas(uv, uv_faces, rows, columns)
-    return np.ascontiguousarray(uv.numpy()), np.ascontiguousarray(uv_faces.numpy(), dtype=np.int32), areas.numpy()
+    return array(uv, dtype), array(uv_faces, torch.int32), array(areas, dtype)
 
 
 def render_by_stages(
@@ -215,7 +242,7 @@ def render_by_stages(
     face_img = rasterize(vertices_clip, faces, height, width)
     everything = look(slice(None), face_img, barycentrics(vertices_clip, faces, face_img))
     blended = []
-    for frame, crossings in enumerate(find_crossings(face_img, vertices_clip, faces)):
+    for frame, crossings in enumerate(find_crossings(face_img, vertices_clip, faces, float(camera.focal) * height / 2)):
         owners, coordinates = edge_points(crossings, vertices_clip[frame], faces, height, width)
         edge_colors = look(slice(frame, frame + 1), owners[None, None], coordinates[None, None])[0, 0]
         meets = [n for n, crossing in enumerate(crossings) if isinstance(crossing, Meeting)]
@@ -241,6 +268,15 @@ def _check(
             raise ValueError(f"buffers: expected names among {', '.join(BUFFERS)}, got {name!r}")
     if vertices.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"vertices: expected float32 or float64, got {vertices.dtype}")
+    for name, values in (
+        ("faces", faces), ("colors", colors), ("texture", texture), ("uv", uv), ("uv_faces", uv_faces),
+        ("parts", parts), ("attributes", attributes),
+    ):  # fmt: skip
+        if values is not None and values.device != vertices.device:
+            raise ValueError(
+                f"{name}: expected it on {vertices.device}, where the vertices are, got {values.device}; move it with "
+                ".to()"
+            )
     if height < 1 or width < 1:
         raise ValueError(f"picture size: expected at least 1 x 1 pixels, got {width} x {height}")
     if len(background) != 3:

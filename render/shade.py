@@ -41,7 +41,9 @@ class Light:
     def coefficients(self) -> Float[Tensor, "4"]:
         """Ambient, diffuse, specular, shininess; a gradient reaches those that are tensors."""
         numbers = (self.ambient, self.diffuse, self.specular, self.shininess)
-        return torch.stack([torch.as_tensor(number).to(self.position) for number in numbers])
+        return torch.stack(
+            [torch.as_tensor(n, dtype=self.position.dtype, device=self.position.device) for n in numbers]
+        )
 
 
 def linear_from_srgb(srgb: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:

@@ -7,8 +7,8 @@ import torch
 from conftest import make_toy_rig
 
 from reenact.errors import ReenactError
-from reenact.portrait import EYE_HEIGHT, MAKEUP, MOUTH_HEIGHT, Portrait, face_lines, made_up
-from reenact.rigs import anny
+from reenact.portrait import EYE_HEIGHT, MAKEUP, MOUTH_HEIGHT, Portrait, face_lines, fit_weights, made_up
+from reenact.rigs import anny, motion
 
 
 @pytest.mark.parametrize("name", sorted(anny.BUILT_IN))
@@ -94,3 +94,13 @@ def test_the_motion_pass_says_how_far_visible_points_moved(toy_rig):
     seen = motion["motion"][0][:, inside]
     torch.testing.assert_close(seen, (portrait.scale * step)[:, None].expand_as(seen), rtol=1e-4, atol=0)  # float32
     assert not portrait.render(toy_rig.neutral[None], 32, ("motion",))["motion"].any()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_weights_are_found_from_a_picture_alone(seed):
+    rig = anny.build("anny:man")
+    portrait = Portrait.of(rig)
+    goal = rig.vertices(motion.expressions(rig.names, 1, seed))
+    fitted = rig.vertices(fit_weights(portrait, portrait.render(goal, 128)["color"]))
+    error = (fitted - goal).norm() / (goal - rig.neutral).norm()
+    assert error < 0.02  # 0.001 and 0.0002 measured

@@ -113,7 +113,7 @@ def test_neighbours_lie_across_the_edge_opposite_each_corner():
 
 def test_a_surface_keeps_its_colour_up_to_the_crossing():
     # A ramp from black at the centre of column 4 to 1 at the edge, which lies 0.8 columns on; what is behind is 0.5.
-    outline = Outline((0, 4), (0, 5), (0, 1), 0, 1.0)
+    outline = Outline((0, 4), (0, 5), (0, 1), 0)
     row = torch.full((1, 8, 1), 0.5, dtype=torch.float64)
     row[0, 4] = 0
     blended = blend(row, torch.ones(1, 1, dtype=torch.float64), torch.tensor([0.8], dtype=torch.float64), [outline])
@@ -123,15 +123,13 @@ def test_a_surface_keeps_its_colour_up_to_the_crossing():
 
 
 def crossed_planes() -> tuple[torch.Tensor, torch.Tensor]:
-    """Two squares that pass through one another along an upright line at column 7.3 of a 12 x 16 picture.
+    """Two rectangles that pass through one another along an upright line at column 7.3 of a 12 x 16 picture.
 
-    Their depths are 2 and 1 at column -3 and as much apart the other way at column 17.6.
+    Their depths are 8 and 1 at column 4 and as much apart the other way at column 10.6.
     """
-    left, right = -3.0, 17.6
-    first = torch.cat([at_pixels([(left, -3), (left, 14)], 12, 16, 2.0), at_pixels([(right, 14), (right, -3)], 12, 16)])
-    second = torch.cat(
-        [at_pixels([(left, -3), (left, 14)], 12, 16), at_pixels([(right, 14), (right, -3)], 12, 16, 2.0)]
-    )
+    left, right = [(4.0, -3), (4.0, 14)], [(10.6, 14), (10.6, -3)]
+    first = torch.cat([at_pixels(left, 12, 16, 8.0), at_pixels(right, 12, 16)])
+    second = torch.cat([at_pixels(left, 12, 16), at_pixels(right, 12, 16, 8.0)])
     return torch.cat([first, second])[None], torch.cat([SQUARE, SQUARE + 4])
 
 
@@ -158,13 +156,13 @@ def test_where_two_sheets_meet_moves_with_both():
         vertices, faces, flat_camera(12), ambient(), height=12, width=16, attributes=attributes, buffers=("attributes",)
     )  # fmt: skip
     made["attributes"].sum().backward()
-    # Inverse depths run from 1/2 to 1 and from 1 to 1/2 over 20.6 columns. A rise of the first by r at the left end is
-    # one of r / 2 where they meet, half way, and moves that place by 20.6 r / 2 columns to the left. A step of 1 m
-    # towards the eye at depth 2 is a rise of 1/4.
+    # Inverse depths run from 1/8 to 1 and from 1 to 1/8 over 6.6 columns. A rise of the first by r at the left end is
+    # one of r / 2 where they meet, half way, where their difference changes by 1.75 / 6.6 a column: that place moves by
+    # 3.3 r / 1.75 columns to the left. A step of 1 m towards the eye at depth 8 is a rise of 1/64.
     nearer = torch.zeros_like(vertices)
-    nearer[0, :2] = vertices[0, :2].detach() / -2  # along the ray: the picture of the corners stays
+    nearer[0, :2] = vertices[0, :2].detach() / -8  # along the ray: the picture of the corners stays
     moved = (vertices.grad * nearer).sum().item()
-    assert moved == pytest.approx(-12 * 20.6 / 2 / 4, rel=1e-6)  # 12 rows
+    assert moved == pytest.approx(-12 * 3.3 / 1.75 / 64, rel=1e-6)  # 12 rows
 
 
 @pytest.mark.parametrize("stage", ["outlines", "meetings", "edge_points", "blend", "inverse_depth"])
@@ -176,7 +174,7 @@ def test_gradients_of_a_stage_match_finite_differences(stage):
         scene = bumpy_spheres()
         vertices, faces, camera, height, width = scene["vertices"][:1], scene["faces"], scene["camera"], 14, 13
     clip = camera.project(vertices)
-    crossings = find_crossings(rasterize(clip, faces, height, width), clip, faces)[0]
+    crossings = find_crossings(rasterize(clip, faces, height, width), clip, faces, camera.focal * height / 2)[0]
     kind = Meeting if stage == "meetings" else Outline
     crossings = [crossing for crossing in crossings if isinstance(crossing, kind)][:12]
     assert len(crossings) == 12
@@ -200,6 +198,7 @@ def test_gradients_of_a_stage_match_finite_differences(stage):
 def test_at_most_one_crossing_lies_between_two_pixels():
     scene = bumpy_spheres(2)
     clip = scene["camera"].project(scene["vertices"])
-    for crossings in find_crossings(rasterize(clip, scene["faces"], 24, 20), clip, scene["faces"]):
+    face_img = rasterize(clip, scene["faces"], 24, 20)
+    for crossings in find_crossings(face_img, clip, scene["faces"], 12 * scene["camera"].focal):
         pairs = [frozenset([crossing.surface, crossing.behind]) for crossing in crossings]
         assert len(pairs) == len(set(pairs)) > 20

@@ -65,8 +65,8 @@ class Kept(NamedTuple):
     inverse_img: np.ndarray  # (B, H, W) inverse depth, 0 is the background
     samples: np.ndarray  # (B, H * W + N, C) linear colour, coverage, normal if asked for, attributes
     pair_img: np.ndarray  # (B, 2, H, W) int32: the crossing between a pixel and the next in its row, in its column
-    places: np.ndarray  # (B, N, 6) int32: see `_silhouettes` and `_intersections`
-    crossings: np.ndarray  # (B, N, 3) distance from the surface's pixel centre, position from p to q, share
+    places: np.ndarray  # (B, N, 6) int32: see `_silhouettes` and `_cross_sheets`
+    crossings: np.ndarray  # (B, N, 2) the same
     mixed: np.ndarray  # (B, N, 2, C) what the two pixels were before they were blended
     counts: np.ndarray  # (B,) crossings
 
@@ -292,8 +292,12 @@ def _walk(screen, mesh, sides, f, x, y):
 def _cross_sheets(
     screen, faces, f, g_before, f_after, g, row, column, along, width, pair_img, places, crossings, count
 ):  # fmt: skip
-    """Notes where sheet f, seen at a pixel, passes under sheet g, seen at the next one; how many crossings now."""
-    zero, half, one, two = screen.dtype.type(0), screen.dtype.type(0.5), screen.dtype.type(1), screen.dtype.type(2)
+    """Notes where sheet f, seen at a pixel, passes under sheet g, seen at the next one; how many crossings now.
+
+    Its place is the face seen at the pixel, that of g below it, that of f below the next pixel, both pixels, and the
+    face seen at the next one; its numbers are the distance from the pixel's centre and the sum of both gaps.
+    """
+    zero, one = screen.dtype.type(0), screen.dtype.type(1)
     row_after, column_after = (row, column + 1) if along == 0 else (row + 1, column)
     x, y = screen.dtype.type(column), screen.dtype.type(row)
     x_after, y_after = screen.dtype.type(column_after), screen.dtype.type(row_after)
@@ -305,8 +309,7 @@ def _cross_sheets(
     slope_x -= _inverse_at(screen, faces, g, x + one, y) - _inverse_at(screen, faces, g, x, y)
     slope_y = _inverse_at(screen, faces, f, x, y + one) - _inverse_at(screen, faces, f, x, y)
     slope_y -= _inverse_at(screen, faces, g, x, y + one) - _inverse_at(screen, faces, g, x, y)
-    reach, drift = (abs(slope_x), abs(slope_y)) if along == 0 else (abs(slope_y), abs(slope_x))
-    if not two * reach > drift:
+    if along != (0 if abs(slope_x) > abs(slope_y) else 1):
         return count
     index = pair_img[along, row, column]
     if index < 0:
@@ -321,7 +324,6 @@ def _cross_sheets(
     places[index, 5] = g
     crossings[index, 0] = before / (before + after)
     crossings[index, 1] = before + after
-    crossings[index, 2] = one if reach >= two * drift else half
     return count
 
 
@@ -329,10 +331,11 @@ def _cross_sheets(
 def _silhouettes(screen, mesh, sides, face_img, inverse_img, margin, pair_img, places, crossings):
     """Where the outline of a surface passes between the centres of two neighbouring pixels; returns how often.
 
-    Of several crossings between two centres the outermost is kept.
+    Of several crossings between two centres the outermost is kept. Its place is the vertices p and q of the edge, its
+    face, the pixel of the surface, the one behind it, and -1; its numbers are the distance from the surface's centre
+    and the position from p to q.
     """
-    half, two = screen.dtype.type(0.5), screen.dtype.type(2)
-    zero, one = screen.dtype.type(0), screen.dtype.type(1)
+    half, zero, one = screen.dtype.type(0.5), screen.dtype.type(0), screen.dtype.type(1)
     height, width = inverse_img.shape
     pair_img[:] = -1
     count = 0
@@ -346,79 +349,77 @@ def _silhouettes(screen, mesh, sides, face_img, inverse_img, margin, pair_img, p
             f = g
         a, b = mesh.edges[e, 0], mesh.edges[e, 1]
         o = mesh.faces[f, 0] + mesh.faces[f, 1] + mesh.faces[f, 2] - a - b
-        for along in range(2):
-            # Rows (along == 0) meet a steep edge, columns a shallow one, both with half the share one between. Below,
-            # "s" runs over the rows (columns) and "t" is the column (row) of the crossing.
-            across = 1 - along
-            p, q = (a, b) if screen[a, across] < screen[b, across] else (b, a)
-            s0, s1, t0, t1 = screen[p, across], screen[q, across], screen[p, along], screen[q, along]
-            reach, drift = s1 - s0, abs(t1 - t0)
-            if not two * reach > drift:
+        # Rows (along == 0) meet a steep edge, columns a shallow one. Below, "s" runs over the rows (columns) and "t" is
+        # the column (row) of the crossing.
+        along = 0 if abs(screen[b, 1] - screen[a, 1]) > abs(screen[b, 0] - screen[a, 0]) else 1
+        across = 1 - along
+        p, q = (a, b) if screen[a, across] < screen[b, across] else (b, a)
+        s0, s1, t0, t1 = screen[p, across], screen[q, across], screen[p, along], screen[q, along]
+        if not s1 > s0:
+            continue
+        reach = s1 - s0
+        slope = (t1 - t0) / reach
+        surface_before = screen[o, along] < t0 + slope * (screen[o, across] - s0)
+        last_s, last_t = (height - 1, width - 1) if along == 0 else (width - 1, height - 1)
+        if s1 < zero or s0 > screen.dtype.type(last_s):
+            continue
+        first = _ceil(max(s0, zero))
+        last = _ceil(min(s1, screen.dtype.type(last_s + 1)))  # not included: the next edge of the outline takes it
+        for step in range(first, last):
+            fraction = (screen.dtype.type(step) - s0) / reach
+            t = t0 + fraction * (t1 - t0)
+            if not (t >= zero and t < screen.dtype.type(last_t)):
                 continue
-            share = one if reach >= two * drift else half
-            slope = (t1 - t0) / reach
-            surface_before = screen[o, along] < t0 + slope * (screen[o, across] - s0)
-            last_s, last_t = (height - 1, width - 1) if along == 0 else (width - 1, height - 1)
-            if s1 < zero or s0 > screen.dtype.type(last_s):
+            cell = int(t)
+            inverse_edge = screen[p, 2] + fraction * (screen[q, 2] - screen[p, 2])
+            row, column = (step, cell) if along == 0 else (cell, step)
+            row_after, column_after = (row, column + 1) if along == 0 else (row + 1, column)
+            before, after = inverse_img[row, column], inverse_img[row_after, column_after]
+            surface, behind = (before, after) if surface_before else (after, before)
+            if behind > inverse_edge * (one - margin) or surface < half * (inverse_edge + behind):
                 continue
-            first = _ceil(max(s0, zero))
-            last = _ceil(min(s1, screen.dtype.type(last_s + 1)))  # not included: the next edge of the outline takes it
-            for step in range(first, last):
-                fraction = (screen.dtype.type(step) - s0) / reach
-                t = t0 + fraction * (t1 - t0)
-                if not (t >= zero and t < screen.dtype.type(last_t)):
+            if behind > zero:
+                # What is behind may come before the edge on its way there: then the surface passes under it first.
+                other = face_img[row_after, column_after] if surface_before else face_img[row, column]
+                x, y = (t, screen.dtype.type(row)) if along == 0 else (screen.dtype.type(column), t)
+                g = _walk(screen, mesh, sides, other, x, y)
+                if g >= 0 and _inverse_at(screen, mesh.faces, g, x, y) > inverse_edge:
+                    near, far = (f, g) if surface_before else (g, f)
+                    count = _cross_sheets(
+                        screen, mesh.faces, near, far, near, far, row, column, along, width, pair_img, places,
+                        crossings, count,
+                    )  # fmt: skip
                     continue
-                cell = int(t)
-                inverse_edge = screen[p, 2] + fraction * (screen[q, 2] - screen[p, 2])
-                row, column = (step, cell) if along == 0 else (cell, step)
-                row_after, column_after = (row, column + 1) if along == 0 else (row + 1, column)
-                before, after = inverse_img[row, column], inverse_img[row_after, column_after]
-                surface, behind = (before, after) if surface_before else (after, before)
-                if behind > inverse_edge * (one - margin) or surface < half * (inverse_edge + behind):
-                    continue
-                if behind > zero:
-                    # What is behind may come before the edge on its way there: then the surface passes under it first.
-                    other = face_img[row_after, column_after] if surface_before else face_img[row, column]
-                    x, y = (t, screen.dtype.type(row)) if along == 0 else (screen.dtype.type(column), t)
-                    g = _walk(screen, mesh, sides, other, x, y)
-                    if g >= 0 and _inverse_at(screen, mesh.faces, g, x, y) > inverse_edge:
-                        near, far = (f, g) if surface_before else (g, f)
-                        count = _cross_sheets(
-                            screen, mesh.faces, near, far, near, far, row, column, along, width, pair_img, places,
-                            crossings, count,
-                        )  # fmt: skip
-                        continue
-                distance = t - screen.dtype.type(cell)
-                pixel, other = row * width + column, row_after * width + column_after
-                if not surface_before:
-                    distance, pixel, other = one - distance, other, pixel
-                index = pair_img[along, row, column]
-                if index < 0:
-                    index = count
-                    count += 1
-                    pair_img[along, row, column] = index
-                elif places[index, 5] >= 0 or places[index, 3] != pixel or distance <= crossings[index, 0]:
-                    continue
-                places[index, 0] = p
-                places[index, 1] = q
-                places[index, 2] = f
-                places[index, 3] = pixel
-                places[index, 4] = other
-                places[index, 5] = -1
-                crossings[index, 0] = distance
-                crossings[index, 1] = fraction
-                crossings[index, 2] = share
+            distance = t - screen.dtype.type(cell)
+            pixel, other = row * width + column, row_after * width + column_after
+            if not surface_before:
+                distance, pixel, other = one - distance, other, pixel
+            index = pair_img[along, row, column]
+            if index < 0:
+                index = count
+                count += 1
+                pair_img[along, row, column] = index
+            elif places[index, 5] >= 0 or distance <= crossings[index, 0]:
+                continue
+            places[index, 0] = p
+            places[index, 1] = q
+            places[index, 2] = f
+            places[index, 3] = pixel
+            places[index, 4] = other
+            places[index, 5] = -1
+            crossings[index, 0] = distance
+            crossings[index, 1] = fraction
     return count
 
 
 @_exact
-def _valleys(inverse_img, row, along, valleys):
-    """Where the surface seen in a row may be a groove between a pixel and the next: its slope rises by a step there.
+def _valleys(inverse_img, row, along, step, valleys):
+    """Where the surface seen in a row may be a groove between a pixel and the next: its slope rises by `step` there.
 
     A place between smooth parts of one sheet seldom is one, and the place where two sheets meet always is.
     """
     height, width = inverse_img.shape
-    two, step = inverse_img.dtype.type(2), inverse_img.dtype.type(2e-4)
+    two = inverse_img.dtype.type(2)
     before, after = max(row - along, 0), min(row + 2 * along, height - 1)
     last = width - 1 + along
     for column in range(last):
@@ -430,8 +431,18 @@ def _valleys(inverse_img, row, along, valleys):
         valleys[column] = (a > 0) & (b > 0) & (max(first, second) > step * a)
 
 
+@_inlined
+def _touch(faces, f, g):
+    """Whether two faces share a corner."""
+    i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+    a, b, c = faces[g, 0], faces[g, 1], faces[g, 2]
+    return (
+        (i == a) | (i == b) | (i == c) | (j == a) | (j == b) | (j == c) | (k == a) | (k == b) | (k == c)
+    )  # fmt: skip
+
+
 @_compiled
-def _intersections(screen, mesh, sides, face_img, inverse_img, pair_img, places, crossings, count):
+def _intersections(screen, mesh, sides, face_img, inverse_img, step, pair_img, places, crossings, count):
     """Where two sheets pass through one another between the centres of two neighbouring pixels; how many crossings now.
 
     Both sheets reach under both centres, and each is the nearer one at one of them.
@@ -441,13 +452,13 @@ def _intersections(screen, mesh, sides, face_img, inverse_img, pair_img, places,
     valleys = np.zeros(width, np.bool_)
     for along in range(2):
         for row in range(height - along):
-            _valleys(inverse_img, row, along, valleys)
+            _valleys(inverse_img, row, along, step, valleys)
             for column in range(width - 1 + along):
                 if not valleys[column]:
                     continue
                 row_after, column_after = (row, column + 1) if along == 0 else (row + 1, column)
                 f, g = face_img[row, column], face_img[row_after, column_after]
-                if f == g:
+                if _touch(faces, f, g):
                     continue
                 x, y = screen.dtype.type(column), screen.dtype.type(row)
                 x_after, y_after = screen.dtype.type(column_after), screen.dtype.type(row_after)
@@ -1193,15 +1204,15 @@ def _blend(places, crossings, count, first, samples, mixed):
             mixed[n, 0, c] = samples[places[n, 3], c]
             mixed[n, 1, c] = samples[places[n, 4], c]
     for n in range(count):
-        t, share = crossings[n, 0], crossings[n, 2]
+        t = crossings[n, 0]
         for c in range(channels):
             surface, behind, edge = mixed[n, 0, c], mixed[n, 1, c], samples[first + n, c]
             if t < half:
-                samples[places[n, 3], c] += share * (half * t * (surface + edge) + (half - t) * behind - half * surface)
+                samples[places[n, 3], c] += half * t * (surface + edge) + (half - t) * behind - half * surface
             else:
                 ramp = (edge - surface) / t
-                samples[places[n, 3], c] += share * eighth * ramp
-                samples[places[n, 4], c] += share * ((t - half) * (surface - behind) + (half * t * t - eighth) * ramp)
+                samples[places[n, 3], c] += eighth * ramp
+                samples[places[n, 4], c] += (t - half) * (surface - behind) + (half * t * t - eighth) * ramp
 
 
 @_compiled
@@ -1218,11 +1229,11 @@ def _blend_backward(
             g_mixed[n, 1, c] = g_samples[places[n, 4], c]
     for n in range(count):
         p, q, pixel, other = places[n, 0], places[n, 1], places[n, 3], places[n, 4]
-        t, fraction, share = crossings[n, 0], crossings[n, 1], crossings[n, 2]
+        t, fraction = crossings[n, 0], crossings[n, 1]
         g_t = zero
         for c in range(channels):
             surface, behind, edge = mixed[n, 0, c], mixed[n, 1, c], samples[first + n, c]
-            g_pixel, g_other = share * g_mixed[n, 0, c], share * g_mixed[n, 1, c]
+            g_pixel, g_other = g_mixed[n, 0, c], g_mixed[n, 1, c]
             if t < half:
                 g_samples[pixel, c] += half * (t - one) * g_pixel
                 g_samples[other, c] += (half - t) * g_pixel
@@ -1430,19 +1441,19 @@ def forward_pixels(worker, first, last, tiles, mesh, look, attributes, kept, can
 
 
 @_compiled
-def forward_silhouettes(worker, first, last, mesh, look, attributes, margin, kept):
+def forward_silhouettes(worker, first, last, mesh, look, attributes, limits, kept):
     pixels = kept.face_img.shape[1] * kept.face_img.shape[2]
     for b in range(first, last):
         if not kept.finite[b]:
             continue
         count = _silhouettes(
-            kept.screen[b], mesh, kept.sides[b], kept.face_img[b], kept.inverse_img[b], margin, kept.pair_img[b],
+            kept.screen[b], mesh, kept.sides[b], kept.face_img[b], kept.inverse_img[b], limits[1], kept.pair_img[b],
             kept.places[b],
             kept.crossings[b],
         )  # fmt: skip
         count = _intersections(
-            kept.screen[b], mesh, kept.sides[b], kept.face_img[b], kept.inverse_img[b], kept.pair_img[b],
-            kept.places[b], kept.crossings[b], count,
+            kept.screen[b], mesh, kept.sides[b], kept.face_img[b], kept.inverse_img[b], limits[2] / look.lens[0],
+            kept.pair_img[b], kept.places[b], kept.crossings[b], count,
         )  # fmt: skip
         kept.counts[b] = count
         _shade_crossings(
@@ -1464,11 +1475,11 @@ def forward_encoding(worker, first, last, tiles, kept, color, mask, extras):
 
 @_compiled
 def forward(worker, first, last, world, mesh, look, attributes, limits, kept, candidates, color, mask, extras):
-    """Whole frames; `limits` is the near plane and the relative depth margin of silhouettes."""
+    """Whole frames; `limits` is the near plane, and the depth margin and the valley of silhouettes."""
     for b in range(first, last):
         forward_vertices(worker, b, b + 1, world, mesh, look, limits[0], kept)
         forward_pixels(worker, b, b + 1, 1, mesh, look, attributes, kept, candidates)
-        forward_silhouettes(worker, b, b + 1, mesh, look, attributes, limits[1], kept)
+        forward_silhouettes(worker, b, b + 1, mesh, look, attributes, limits, kept)
         forward_encoding(worker, b, b + 1, 1, kept, color, mask, extras)
 
 

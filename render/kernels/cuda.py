@@ -16,11 +16,18 @@ its column. A sample is a point of the surface that gets a colour: the H * W pix
 
 # Warp needs annotations that are no types, so the checks of our test run leave kernels alone: `no_type_check`.
 
-from typing import no_type_check
+import sys
+from contextlib import contextmanager
+from functools import cache, partial
+from threading import Timer
+from typing import NamedTuple, no_type_check
 
+import torch
 import warp as wp
+from torch import Tensor
 
 from render.antialias import DEPTH_MARGIN, VALLEY, WALK
+from render.kernels import function
 from render.rasterize import NEAR
 
 # Two faces must agree to the last bit on their edge, so products and sums are not fused.
@@ -28,7 +35,8 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 _NEAR, _MARGIN, _VALLEY = wp.constant(NEAR), wp.constant(DEPTH_MARGIN), wp.constant(VALLEY)
 _WALK = wp.constant(WALK)
-_LAST = wp.constant(2**31 - 1)
+_LAST = wp.constant(wp.int32(2**31 - 1))
+_FARTHEST = wp.constant(2.0)  # more than any distance between two pixel centres
 _SLOTS = 1024
 """Sums over all samples are kept in so many parts at first, so that threads do not wait for one another."""
 _COUNT = wp.constant(_SLOTS)
@@ -40,7 +48,7 @@ _COUNT = wp.constant(_SLOTS)
 @wp.struct
 @no_type_check
 class _Mesh:
-    """As `cpu.Mesh`, and the faces around each vertex: `incident[starts[v]]` to `incident[starts[v + 1] - 1]`."""
+    """As `cpu.Mesh`, and the corners of faces at each vertex, `incident[starts[v]:starts[v + 1]]`, as 3 f + corner."""
 
     faces: wp.array(dtype=wp.vec3i)
     edges: wp.array(dtype=wp.vec4i)
@@ -86,7 +94,7 @@ class _Frames:
     samples: wp.array3d(dtype=wp.float32)  # (B, 3 P, C) linear colour, coverage, normal if asked for, attributes
     blended: wp.array2d(dtype=wp.vec4)  # (B, P) linear colour and coverage of the picture
     places: wp.array2d(dtype=wp.vec4i)  # (B, 2 P) see `_Crossing`; the first is -1 where there is none
-    crossings: wp.array2d(dtype=wp.vec4)  # (B, 2 P)
+    crossings: wp.array2d(dtype=wp.vec3)  # (B, 2 P)
 
 
 @wp.struct
@@ -115,7 +123,7 @@ class _Edge:
     s1: wp.float32
     t0: wp.float32
     t1: wp.float32
-    share: wp.float32  # 0 if it is no outline, or one that they do not look for
+    is_met: wp.bool  # whether it is an outline, and they are the ones to meet it
     before: wp.int32  # 1 if the surface lies on the side of the smaller t
 
 
@@ -125,9 +133,9 @@ class _Crossing:
     kind: wp.int32  # 0 for none, 1 for an outline, 2 for a meeting of two sheets
     cell: wp.int32  # the smaller t of the two pixels
     places: wp.vec4i  # outline: p, q, face, -1; meeting: face seen and below at the first pixel, below and seen at next
-    # Distance from the surface's pixel centre; position from p to q, or the sum of both gaps; share; 1 if the surface
-    # is at the second pixel.
-    numbers: wp.vec4
+    # Distance from the surface's pixel centre; position from p to q, or the sum of both gaps; 1 if the surface is the
+    # second pixel.
+    numbers: wp.vec3
 
 
 @wp.struct
@@ -177,7 +185,7 @@ def _project(world: wp.array2d(dtype=wp.vec3), look: _Look, frames: _Frames, bad
     z = m[2, 0] * w[0] + m[2, 1] * w[1] + m[2, 2] * w[2] + m[2, 3]
     if not wp.isfinite(x + y + z):
         bad[0] = 1
-    inverse = 0.0
+    inverse = wp.float32(0.0)
     if -z > _NEAR:
         inverse = 1.0 / -z
     frames.vertices[b, v] = wp.vec3(x, y, z)
@@ -191,7 +199,7 @@ def _vertex_normals(mesh: _Mesh, frames: _Frames):
     b, v = wp.tid()
     total = wp.vec3(0.0, 0.0, 0.0)
     for n in range(mesh.starts[v], mesh.starts[v + 1]):
-        face = mesh.faces[mesh.incident[n]]
+        face = mesh.faces[mesh.incident[n] // 3]
         first = frames.vertices[b, face[0]]
         total += wp.cross(frames.vertices[b, face[1]] - first, frames.vertices[b, face[2]] - first)
     length = wp.sqrt(wp.dot(total, total))
@@ -229,7 +237,8 @@ def _first_of(key: wp.int64) -> wp.float32:
 @wp.func
 @no_type_check
 def _second_of(key: wp.int64) -> wp.int32:
-    return _LAST - wp.int32(key & wp.int64(_LAST))
+    # Shifted up and down again, which leaves the lower half.
+    return _LAST - wp.int32((key << wp.int64(32)) >> wp.int64(32))
 
 
 @wp.kernel
@@ -325,13 +334,9 @@ def _walk(mesh: _Mesh, frames: _Frames, b: wp.int32, start: wp.int32, x: wp.floa
 
 @wp.func
 @no_type_check
-def _share(reach: wp.float32, drift: wp.float32) -> wp.float32:
-    """Rows (columns) meet what is steep (shallow), both with half the share what is between."""
-    if not 2.0 * reach > drift:
-        return 0.0
-    if reach >= 2.0 * drift:
-        return 1.0
-    return 0.5
+def _is_met(x: wp.float32, y: wp.float32, along: wp.int32) -> wp.bool:
+    """Whether rows (columns, along == 1) are the ones to meet a line whose normal has these sizes along x and y."""
+    return (x > y and along == 0) or (y >= x and along == 1)
 
 
 @wp.func
@@ -353,16 +358,13 @@ def _meeting(
         slope_x -= _inverse_at(mesh, frames, b, g, x + 1.0, y) - at_g
         slope_y = _inverse_at(mesh, frames, b, f, x, y + 1.0) - at_f
         slope_y -= _inverse_at(mesh, frames, b, g, x, y + 1.0) - at_g
-        share = _share(wp.abs(slope_x), wp.abs(slope_y))
-        if along == 1:
-            share = _share(wp.abs(slope_y), wp.abs(slope_x))
-        if share > 0.0:
+        if _is_met(wp.abs(slope_x), wp.abs(slope_y), along):
             made.kind = 2
             made.cell = column
             if along == 1:
                 made.cell = row
             made.places = wp.vec4i(f, g_before, f_after, g)
-            made.numbers = wp.vec4(before / (before + after), before + after, share, 0.0)
+            made.numbers = wp.vec3(before / (before + after), before + after, 0.0)
     return made
 
 
@@ -370,13 +372,11 @@ def _meeting(
 @no_type_check
 def _edge(mesh: _Mesh, frames: _Frames, b: wp.int32, e: wp.int32, along: wp.int32) -> _Edge:
     made = _Edge()
-    made.share = 0.0
+    made.is_met = False
     edge = mesh.edges[e]
     f = edge[2]
     f_front = frames.sides[b, f] != wp.uint8(0)
-    g_front = False
-    if edge[3] >= 0:
-        g_front = frames.sides[b, edge[3]] != wp.uint8(0)
+    g_front = edge[3] >= 0 and frames.sides[b, edge[3]] != wp.uint8(0)
     if f_front == g_front:
         return made
     if g_front:
@@ -387,10 +387,16 @@ def _edge(mesh: _Mesh, frames: _Frames, b: wp.int32, e: wp.int32, along: wp.int3
     if not frames.screen[b, p][across] < frames.screen[b, q][across]:
         p, q = edge[1], edge[0]
     first, second, third = frames.screen[b, p], frames.screen[b, q], frames.screen[b, o]
-    made.p, made.q, made.face = p, q, f
-    made.s0, made.s1, made.t0, made.t1 = first[across], second[across], first[along], second[along]
+    made.p = p
+    made.q = q
+    made.face = f
+    made.s0 = first[across]
+    made.s1 = second[across]
+    made.t0 = first[along]
+    made.t1 = second[along]
     reach = made.s1 - made.s0
-    made.share = _share(reach, wp.abs(made.t1 - made.t0))
+    drift = wp.abs(made.t1 - made.t0)
+    made.is_met = (_is_met(reach, drift, 0) and along == 0) or (_is_met(drift, reach, 1) and along == 1)
     slope = (made.t1 - made.t0) / reach
     made.before = 0
     if third[along] < made.t0 + slope * (third[across] - made.s0):
@@ -418,49 +424,45 @@ def _crossing(
     inverse_edge = near + fraction * (far - near)
     row, column = step, cell
     pixel = row * look.width + column
-    next = pixel + 1
+    after = pixel + 1
     x, y = t, wp.float32(row)
     if along == 1:
         row, column = cell, step
         pixel = row * look.width + column
-        next = pixel + look.width
+        after = pixel + look.width
         x, y = wp.float32(column), t
-    surface, behind, other = frames.inverse_img[b, pixel], frames.inverse_img[b, next], frames.face_img[b, next]
-    distance, side = t - wp.float32(cell), 0.0
+    seen, hidden = pixel, after
+    distance, side = t - wp.float32(cell), wp.float32(0.0)
     if edge.before == 0:
-        surface, behind, other = behind, surface, frames.face_img[b, pixel]
+        seen, hidden = after, pixel
         distance, side = 1.0 - distance, 1.0
+    surface, behind = frames.inverse_img[b, seen], frames.inverse_img[b, hidden]
     if behind > inverse_edge * (1.0 - _MARGIN) or surface < 0.5 * (inverse_edge + behind):
         return made
     if behind > 0.0:
         # What is behind may come before the edge on its way there: then the surface passes under it first.
-        g = _walk(mesh, frames, b, other, x, y)
-        if g >= 0:
-            if _inverse_at(mesh, frames, b, g, x, y) > inverse_edge:
-                f = edge.face
-                if edge.before == 0:
-                    f, g = g, edge.face
-                return _meeting(mesh, frames, b, f, g, f, g, row, column, along)
+        g = _walk(mesh, frames, b, frames.face_img[b, hidden], x, y)
+        if g >= 0 and _inverse_at(mesh, frames, b, g, x, y) > inverse_edge:
+            if edge.before == 1:
+                return _meeting(mesh, frames, b, edge.face, g, edge.face, g, row, column, along)
+            return _meeting(mesh, frames, b, g, edge.face, g, edge.face, row, column, along)
     made.kind = 1
     made.cell = cell
     made.places = wp.vec4i(edge.p, edge.q, edge.face, -1)
-    made.numbers = wp.vec4(distance, fraction, edge.share, side)
+    made.numbers = wp.vec3(distance, fraction, side)
     return made
 
 
 @wp.kernel
 @no_type_check
-def _silhouettes(
-    mesh: _Mesh, look: _Look, frames: _Frames, sides: wp.array2d(dtype=wp.int32), outermost: wp.array3d(dtype=wp.int64),
-    meetings: wp.array2d(dtype=wp.int32),
-):  # fmt: skip
-    """Of each pair: twice the first edge that is an outline there, plus 1 if its surface is at the second pixel; of the
-    outlines of each side the outermost, then first; the last edge where a surface passes under another first."""
+def _silhouettes(mesh: _Mesh, look: _Look, frames: _Frames, outermost: wp.array2d(dtype=wp.int64)):
+    """Of each pair: the outermost outline, the first of equals; before all of these the last edge where a surface
+    passes under another first. The surfaces of a pair's outlines are at the same pixel, the one that is nearer."""
     b, e = wp.tid()
     pixels = look.height * look.width
     for along in range(2):
         edge = _edge(mesh, frames, b, e, along)
-        if edge.share > 0.0:
+        if edge.is_met:
             last_s = look.height - 1
             if along == 1:
                 last_s = look.width - 1
@@ -472,11 +474,9 @@ def _silhouettes(
                     if along == 1:
                         pair = pixels + crossing.cell * look.width + step
                     if crossing.kind == 1:
-                        side = wp.int32(crossing.numbers[3])
-                        wp.atomic_min(sides, b, pair, 2 * e + side)
-                        wp.atomic_max(outermost, b, side, pair, _key(crossing.numbers[0], e))
+                        wp.atomic_max(outermost, b, pair, _key(crossing.numbers[0], e))
                     if crossing.kind == 2:
-                        wp.atomic_max(meetings, b, pair, e)
+                        wp.atomic_max(outermost, b, pair, _key(_FARTHEST, _LAST - e))
 
 
 @wp.func
@@ -486,36 +486,32 @@ def _is_valley(look: _Look, frames: _Frames, b: wp.int32, row: wp.int32, column:
     width = look.width
     before, left = wp.max(row - along, 0), wp.max(column - 1 + along, 0)
     after, right = wp.min(row + 2 * along, look.height - 1), wp.min(column + 2 * (1 - along), width - 1)
-    a, c = (
-        frames.inverse_img[b, row * width + column],
-        frames.inverse_img[b, (row + along) * width + column + 1 - along],
-    )
+    a = frames.inverse_img[b, row * width + column]
+    c = frames.inverse_img[b, (row + along) * width + column + 1 - along]
     first = frames.inverse_img[b, before * width + left] - 2.0 * a + c
     second = a - 2.0 * c + frames.inverse_img[b, after * width + right]
-    return a > 0.0 and c > 0.0 and wp.max(first, second) > _VALLEY * a
+    return a > 0.0 and c > 0.0 and wp.max(first, second) > _VALLEY / look.focal[0] * a
 
 
 @wp.kernel
 @no_type_check
-def _crossings(
-    mesh: _Mesh, look: _Look, frames: _Frames, sides: wp.array2d(dtype=wp.int32), outermost: wp.array3d(dtype=wp.int64),
-    meetings: wp.array2d(dtype=wp.int32),
-):  # fmt: skip
+def _crossings(mesh: _Mesh, look: _Look, frames: _Frames, outermost: wp.array2d(dtype=wp.int64)):
     """The crossing of each pair, if there is one, and the colour there: two sheets that both reach under both pixels
     and pass through one another, or else what an edge tells."""
     b, n = wp.tid()
     pixels = look.height * look.width
-    along, pixel = n / pixels, n % pixels
-    row, column = pixel / look.width, pixel % look.width
+    along, pixel = n // pixels, n % pixels
+    row, column = pixel // look.width, pixel % look.width
     frames.places[b, n] = wp.vec4i(-1, -1, -1, -1)
     if (along == 0 and column == look.width - 1) or (along == 1 and row == look.height - 1):
         return
     found = _Crossing()
     found.kind = 0
-    e = meetings[b, n]
-    if e < 0 and sides[b, n] < _LAST:
-        e = _second_of(outermost[b, sides[b, n] & 1, n])
-    if e >= 0:
+    key = outermost[b, n]
+    if key >= wp.int64(0):
+        e = _second_of(key)
+        if _first_of(key) == _FARTHEST:
+            e = _LAST - e
         step = row
         if along == 1:
             step = column
@@ -539,8 +535,8 @@ def _crossings(
         for c in range(frames.samples.shape[2]):
             frames.samples[b, pixels + n, c] = frames.samples[b, pixel, c]
         return
-    f, bary = found.places[2], _on_edge(mesh, frames, b, found.places, found.numbers[1])
-    _shade(mesh, look, frames, b, f, bary, pixels + n)
+    bary = _on_edge(mesh, frames, b, found.places, found.numbers[1])
+    _shade(mesh, look, frames, b, found.places[2], bary, pixels + n)
 
 
 # Barycentric coordinates of a sample
@@ -551,7 +547,7 @@ def _crossings(
 def _ray(look: _Look, pixel: wp.int32) -> wp.vec2:
     """Where the ray through a pixel centre meets the plane z = -1."""
     inverse = 1.0 / look.focal[0]
-    column, row = wp.float32(pixel % look.width), wp.float32(pixel / look.width)
+    column, row = wp.float32(pixel % look.width), wp.float32(pixel // look.width)
     return wp.vec2((column - look.axis[0]) * inverse, (look.axis[1] - row) * inverse)
 
 
@@ -655,7 +651,7 @@ def _sample_level_backward(
     s, t = at[0] - wp.floor(at[0]), at[1] - wp.floor(at[1])
     columns, rows = wp.float32(level[2]), wp.float32(level[1])
     # Beyond the outer texel centres the texture is constant.
-    u_scale, v_scale = 0.0, 0.0
+    u_scale, v_scale = wp.float32(0.0), wp.float32(0.0)
     if uv[0] * columns > 0.5 and uv[0] * columns < columns - 0.5:
         u_scale = columns
     if uv[1] * rows > 0.5 and uv[1] * rows < rows - 0.5:
@@ -690,7 +686,9 @@ def _surface(mesh: _Mesh, look: _Look, frames: _Frames, b: wp.int32, f: wp.int32
     made = _Surface()
     corners = mesh.faces[f]
     i, j, k = corners[0], corners[1], corners[2]
-    made.face, made.corners, made.bary = f, corners, bary
+    made.face = f
+    made.corners = corners
+    made.bary = bary
     ni, nj, nk = frames.normals[b, i], frames.normals[b, j], frames.normals[b, k]
     normal = bary[0] * ni + bary[1] * nj + bary[2] * nk
     made.normal = wp.vec3(normal[0], normal[1], normal[2])
@@ -726,10 +724,12 @@ def _light(look: _Look, surface: _Surface) -> _Lit:
     made.to_light = made.reach * to_light
     made.near = 1.0 / wp.sqrt(wp.dot(surface.point, surface.point))
     made.to_eye = -made.near * surface.point
-    made.n_l, made.n_v = wp.dot(made.normal, made.to_light), wp.dot(made.normal, made.to_eye)
+    made.n_l = wp.dot(made.normal, made.to_light)
+    made.n_v = wp.dot(made.normal, made.to_eye)
     made.r_v = 2.0 * made.n_l * made.n_v - wp.dot(made.to_light, made.to_eye)
     if not made.n_l > 0.0:
-        made.n_l, made.r_v = 0.0, 0.0
+        made.n_l = 0.0
+        made.r_v = 0.0
     made.power = 0.0  # (r . v) ^ (shininess - 1), 0 where the highlight is not seen
     if made.r_v > 0.0:
         made.power = wp.pow(made.r_v, look.phong[3] - 1.0)
@@ -807,17 +807,16 @@ def _parts_at_pixels(
 
 @wp.func
 @no_type_check
-def _weights(crossing: wp.vec4, is_surface: wp.bool) -> wp.vec3:
+def _weights(t: wp.float32, is_surface: wp.bool) -> wp.vec3:
     """What surface, what is behind and colour at the crossing add to one of the two pixels: see `antialias.blend`."""
-    t, share = crossing[0], crossing[2]
     if t < 0.5:
         if is_surface:
-            return wp.vec3(share * 0.5 * (t - 1.0), share * (0.5 - t), share * 0.5 * t)
+            return wp.vec3(0.5 * (t - 1.0), 0.5 - t, 0.5 * t)
         return wp.vec3(0.0, 0.0, 0.0)
     if is_surface:
-        ramp = share * 0.125 / t
+        ramp = 0.125 / t
         return wp.vec3(-ramp, 0.0, ramp)
-    gain, ramp = share * (t - 0.5), share * (0.5 * t * t - 0.125) / t
+    gain, ramp = t - 0.5, (0.5 * t * t - 0.125) / t
     return wp.vec3(gain - ramp, -gain, ramp)
 
 
@@ -854,35 +853,37 @@ def _encode(
     """Each pixel of a pair gets the mean over its half of the way between the two centres."""
     b, pixel = wp.tid()
     pixels = look.height * look.width
-    row, column = pixel / look.width, pixel % look.width
+    row, column = pixel // look.width, pixel % look.width
+    channels = frames.samples.shape[2]
     blended = wp.vec4(0.0, 0.0, 0.0, 0.0)
-    for c in range(frames.samples.shape[2]):
-        value = frames.samples[b, pixel, c]
-        for side in range(4):
-            # The pairs to the right, to the left, below and above.
-            n = wp.int32(-1)
-            if side == 0:
-                n = pixel
-            elif side == 1 and column > 0:
-                n = pixel - 1
-            elif side == 2:
-                n = pixels + pixel
-            elif side == 3 and row > 0:
-                n = pixels + pixel - look.width
-            if n >= 0:
-                if frames.places[b, n][0] >= 0:
-                    crossing = frames.crossings[b, n]
-                    surface, behind = _first_pixel(look, n), _second_pixel(look, n)
-                    if crossing[3] == 1.0:
-                        surface, behind = behind, surface
-                    weights = _weights(crossing, surface == pixel)
-                    value += weights[0] * frames.samples[b, surface, c]
-                    value += weights[1] * frames.samples[b, behind, c]
-                    value += weights[2] * frames.samples[b, pixels + n, c]
-        if c < 4:
-            blended[c] = value
-        else:
-            extras[b, c - 4, pixel] = value
+    for c in range(4):
+        blended[c] = frames.samples[b, pixel, c]
+    for c in range(4, channels):
+        extras[b, c - 4, pixel] = frames.samples[b, pixel, c]
+    for side in range(4):
+        # The pairs to the right, to the left, below and above.
+        n = wp.int32(-1)
+        if side == 0:
+            n = pixel
+        elif side == 1 and column > 0:
+            n = pixel - 1
+        elif side == 2:
+            n = pixels + pixel
+        elif side == 3 and row > 0:
+            n = pixels + pixel - look.width
+        if n >= 0 and frames.places[b, n][0] >= 0:
+            crossing = frames.crossings[b, n]
+            surface, behind = _first_pixel(look, n), _second_pixel(look, n)
+            if crossing[2] == 1.0:
+                surface, behind = behind, surface
+            weights = _weights(crossing[0], surface == pixel)
+            for c in range(channels):
+                change = weights[0] * frames.samples[b, surface, c] + weights[1] * frames.samples[b, behind, c]
+                change += weights[2] * frames.samples[b, pixels + n, c]
+                if c < 4:
+                    blended[c] = blended[c] + change
+                else:
+                    extras[b, c - 4, pixel] = extras[b, c - 4, pixel] + change
     frames.blended[b, pixel] = blended
     for c in range(3):
         color[b, c, pixel] = _srgb(blended[c])
@@ -903,12 +904,12 @@ def _encode_backward(
     b, pixel = wp.tid()
     blended = frames.blended[b, pixel]
     for c in range(frames.samples.shape[2]):
-        gradient = 0.0
+        gradient = wp.float32(0.0)
         if c < 3:
             if g_color.shape[0] > 0:
                 x = blended[c]
                 if x > 0.0 and x < 1.0:
-                    slope = 12.92
+                    slope = wp.float32(12.92)
                     if x > 0.0031308:
                         slope = (color[b, c, pixel] + 0.055) / (2.4 * x)
                     gradient = slope * g_color[b, c, pixel]
@@ -958,11 +959,11 @@ def _blend_backward(mesh: _Mesh, look: _Look, frames: _Frames, g_blended: wp.arr
     pixels = look.height * look.width
     edge = pixels + n
     pixel, other = _first_pixel(look, n), _second_pixel(look, n)
-    if crossing[3] == 1.0:
+    if crossing[2] == 1.0:
         pixel, other = other, pixel
-    t, fraction, share = crossing[0], crossing[1], crossing[2]
-    at_pixel, at_other = _weights(crossing, True), _weights(crossing, False)
-    g_t = 0.0
+    t, fraction = crossing[0], crossing[1]
+    at_pixel, at_other = _weights(t, True), _weights(t, False)
+    g_t = wp.float32(0.0)
     for c in range(frames.samples.shape[2]):
         surface, behind, ending = frames.samples[b, pixel, c], frames.samples[b, other, c], frames.samples[b, edge, c]
         g_pixel, g_other = g_blended[b, pixel, c], g_blended[b, other, c]
@@ -970,27 +971,27 @@ def _blend_backward(mesh: _Mesh, look: _Look, frames: _Frames, g_blended: wp.arr
         g_behind = at_pixel[1] * g_pixel + at_other[1] * g_other
         g_edge = at_pixel[2] * g_pixel + at_other[2] * g_other
         if t < 0.5:
-            g_t += share * g_pixel * (0.5 * (surface + ending) - behind)
+            g_t += g_pixel * (0.5 * (surface + ending) - behind)
         else:
             ramp = (ending - surface) / t
-            g_t += share * g_other * (surface - behind + t * ramp) - g_edge * ramp
+            g_t += g_other * (surface - behind + t * ramp) - g_edge * ramp
         g.samples[b, edge, c] = g_edge
         if places[3] >= 0:
             g_surface += g_edge
         wp.atomic_add(g.samples, b, pixel, c, g_surface)
         wp.atomic_add(g.samples, b, other, c, g_behind)
     if places[3] >= 0:
-        x, y = wp.float32(pixel % look.width), wp.float32(pixel / look.width)
-        x_after, y_after = wp.float32(other % look.width), wp.float32(other / look.width)
+        x, y = wp.float32(pixel % look.width), wp.float32(pixel // look.width)
+        x_after, y_after = wp.float32(other % look.width), wp.float32(other // look.width)
         g_before, g_after = (1.0 - t) / fraction * g_t, -t / fraction * g_t
         _inverse_at_backward(mesh, frames, b, places[0], x, y, g_before, g)
         _inverse_at_backward(mesh, frames, b, places[1], x, y, -g_before, g)
         _inverse_at_backward(mesh, frames, b, places[3], x_after, y_after, g_after, g)
         _inverse_at_backward(mesh, frames, b, places[2], x_after, y_after, -g_after, g)
         return
-    along = n / pixels
+    along = n // pixels
     g_crossing = g_t
-    if crossing[3] == 1.0:
+    if crossing[2] == 1.0:
         g_crossing = -g_t
     first, second = frames.screen[b, places[0]], frames.screen[b, places[1]]
     slope = (second[along] - first[along]) / (second[1 - along] - first[1 - along])
@@ -1009,7 +1010,7 @@ def _light_backward(
     g_highlight = g_color[0] + g_color[1] + g_color[2]
     g_factor = wp.dot(g_color, wp.cw_mul(surface.color, surface.texel))
     # factor = ambient + diffuse n.l, highlight = specular (r.v) ^ shininess, r.v = 2 n.l n.v - l.v.
-    g_r_v, g_n_l = 0.0, 0.0
+    g_r_v, g_n_l = wp.float32(0.0), wp.float32(0.0)
     if lit.r_v > 0.0:
         g_r_v = g_highlight * specular * shininess * lit.power
     if lit.n_l > 0.0:
@@ -1044,7 +1045,7 @@ def _texture_backward(
     between = surface.level - wp.float32(number)
     found = _sample_level_backward(mesh, look, number, surface.uv, 1.0 - between, g_texel, g)
     g_uv = wp.vec2(found[1], found[2])
-    g_z = 0.0
+    g_z = wp.float32(0.0)
     if between > 0.0:
         coarser = _sample_level_backward(mesh, look, number + 1, surface.uv, between, g_texel, g)
         g_uv += wp.vec2(coarser[1], coarser[2])
@@ -1070,7 +1071,7 @@ def _shade_backward(mesh: _Mesh, look: _Look, frames: _Frames, g_inverse: wp.arr
     pixels = look.height * look.width
     is_pixel = sample < pixels
     f = wp.int32(-1)
-    ray, places, fraction = wp.vec2(0.0, 0.0), wp.vec4i(0, 0, 0, 0), 0.0
+    ray, places, fraction = wp.vec2(0.0, 0.0), wp.vec4i(0, 0, 0, 0), wp.float32(0.0)
     bary_and_area = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if is_pixel:
         f = frames.face_img[b, sample]
@@ -1090,7 +1091,7 @@ def _shade_backward(mesh: _Mesh, look: _Look, frames: _Frames, g_inverse: wp.arr
     bary = wp.vec3(bary_and_area[0], bary_and_area[1], bary_and_area[2])
     surface = _surface(mesh, look, frames, b, f, bary)
     lit = _light(look, surface)
-    slot = (b * 3 * pixels + sample) % _COUNT
+    slot = (b + sample) % _COUNT
     g_color = wp.vec3(g.samples[b, sample, 0], g.samples[b, sample, 1], g.samples[b, sample, 2])
     g_unit = wp.vec3(0.0, 0.0, 0.0)
     if look.has_normals == 1:
@@ -1122,13 +1123,13 @@ def _shade_backward(mesh: _Mesh, look: _Look, frames: _Frames, g_inverse: wp.arr
     if not is_pixel:
         for c in range(3):
             wp.atomic_add(g.vertices, b, corners[c], bary[c] * g_point)
-        g_position = 0.0
+        g_position = wp.float32(0.0)
         for c in range(3):
             if corners[c] == places[0]:
                 g_position -= g_bary[c]
             elif corners[c] == places[1]:
                 g_position += g_bary[c]
-        _edge_position_backward(frames, b, places, (sample - pixels) / pixels, fraction, g_position, g)
+        _edge_position_backward(frames, b, places, (sample - pixels) // pixels, fraction, g_position, g)
         return
     # Areas and their sum, see `_bary_and_area`.
     i = _sheared(frames.vertices[b, corners[0]], ray)
@@ -1188,14 +1189,9 @@ def _vertices_backward(
     b, v = wp.tid()
     total = g.vertices[b, v]
     for n in range(mesh.starts[v], mesh.starts[v + 1]):
-        face = mesh.faces[mesh.incident[n]]
+        face, corner = mesh.faces[mesh.incident[n] // 3], mesh.incident[n] % 3
         gradient = g.normals[b, face[0]] + g.normals[b, face[1]] + g.normals[b, face[2]]
         # The sum of (j - i) x (k - i) = j x k + k x i + i x j: each corner by the edge that it does not lie on.
-        corner = wp.int32(0)
-        if face[1] == v:
-            corner = 1
-        elif face[2] == v:
-            corner = 2
         after, last = frames.vertices[b, face[(corner + 1) % 3]], frames.vertices[b, face[(corner + 2) % 3]]
         total += wp.cross(after - last, gradient)
     point, inverse, focal, on_screen = frames.vertices[b, v], frames.screen[b, v][2], look.focal[0], g.screen[b, v]
@@ -1210,3 +1206,254 @@ def _vertices_backward(
         m[0, 1] * total[0] + m[1, 1] * total[1] + m[2, 1] * total[2],
         m[0, 2] * total[0] + m[1, 2] * total[1] + m[2, 2] * total[2],
     )
+
+
+# The torch function
+
+
+class Mesh(NamedTuple):
+    """As `cpu.Mesh`, of tensors on the device."""
+
+    faces: Tensor
+    edges: Tensor
+    neighbours: Tensor
+    starts: Tensor  # (V + 1,) int32, see `_Mesh`
+    incident: Tensor  # (3 F,) int32
+    uv: Tensor
+    uv_faces: Tensor
+    uv_areas: Tensor
+    levels: Tensor
+
+
+class Kept(NamedTuple):
+    """The tensors of `_Frames`."""
+
+    vertices: Tensor
+    screen: Tensor
+    normals: Tensor
+    sides: Tensor
+    face_img: Tensor
+    inverse_img: Tensor
+    samples: Tensor
+    blended: Tensor
+    places: Tensor
+    crossings: Tensor
+
+
+_MESH_KINDS = Mesh(wp.vec3i, wp.vec4i, wp.vec3i, wp.int32, wp.int32, wp.vec2, wp.vec3i, wp.float32, wp.vec3i)
+_KEPT_KINDS = Kept(
+    wp.vec3, wp.vec3, wp.vec4, wp.uint8, wp.int32, wp.float32, wp.float32, wp.vec4, wp.vec4i, wp.vec3
+)  # fmt: skip
+
+
+class Fused(torch.autograd.Function):
+    """As `function.Fused`: the same arguments and results, on the device of the vertices, float32.
+
+    Nothing passes through the CPU but one number, which says whether all vertices are finite.
+    """
+
+    @staticmethod
+    def forward(
+        ctx,
+        world: Tensor,
+        matrix: Tensor,
+        focal: Tensor,
+        colors: Tensor,
+        texels: Tensor,
+        attributes: Tensor,
+        light: Tensor,
+        phong: Tensor,
+        scene: function.Scene,
+    ) -> tuple[Tensor | None, ...]:
+        batch, count = world.shape[:2]
+        height, width, pixels = scene.height, scene.width, scene.height * scene.width
+        extra_channels = (3 if scene.with_normals else 0) + attributes.shape[-1]
+        inputs = [
+            tensor.detach().contiguous() for tensor in (world, matrix, focal, colors, texels, attributes, light, phong)
+        ]
+        numbers, integers = world.new_empty, partial(world.new_empty, dtype=torch.int32)
+        kept = Kept(
+            vertices=numbers(batch, count, 3),
+            screen=numbers(batch, count, 3),
+            normals=numbers(batch, count, 4),
+            sides=world.new_empty(batch, len(scene.mesh.faces), dtype=torch.uint8),
+            face_img=integers((batch, pixels)),
+            inverse_img=numbers(batch, pixels),
+            samples=numbers(batch, 3 * pixels, 4 + extra_channels),
+            blended=numbers(batch, pixels, 4),
+            places=integers((batch, 2 * pixels, 4)),
+            crossings=numbers(batch, 2 * pixels, 3),
+        )
+        mesh, look, frames = _structs(inputs, scene, kept)
+        launch = _launcher(world)
+        bad = world.new_zeros(1, dtype=torch.int32)
+        launch(_project, (batch, count), [_array(inputs[0], wp.vec3), look, frames, _array(bad)])
+        launch(_vertex_normals, (batch, count), [mesh, frames])
+        nearest = _array(world.new_full((batch, pixels), -1, dtype=torch.int64))
+        launch(_rasterize, (batch, len(scene.mesh.faces)), [mesh, look, frames, nearest])
+        launch(_shade_pixels, (batch, pixels), [mesh, look, frames, nearest])
+        outermost = _array(world.new_full((batch, 2 * pixels), -1, dtype=torch.int64))
+        launch(_silhouettes, (batch, len(scene.mesh.edges)), [mesh, look, frames, outermost])
+        launch(_crossings, (batch, 2 * pixels), [mesh, look, frames, outermost])
+        color, mask = numbers(batch, 3, pixels), numbers(batch, pixels)
+        extras = numbers(batch, extra_channels, pixels)
+        launch(_encode, (batch, pixels), [look, frames, _array(color), _array(mask), _array(extras)])
+        part_img = None
+        if scene.parts is not None:
+            part_img = world.new_empty(batch, pixels, dtype=torch.int64)
+            launch(_parts_at_pixels, (batch, pixels), [mesh, look, frames, _array(scene.parts), _array(part_img)])
+            part_img = part_img.view(batch, 1, height, width)
+            ctx.mark_non_differentiable(part_img)
+        # Waits for the device, so it comes last; until here numbers that are not finite do no harm.
+        if bad.item():
+            function._report_not_finite(inputs[0])
+        color = color.view(batch, 3, height, width)
+        if any(ctx.needs_input_grad):
+            ctx.scene = scene
+            ctx.save_for_backward(*inputs, *kept, color)
+            ctx.set_materialize_grads(False)
+        return (
+            color,
+            mask.view(batch, 1, height, width),
+            extras.view(batch, extra_channels, height, width),
+            kept.inverse_img.clone().view(batch, 1, height, width) if scene.with_depth else None,
+            part_img,
+        )
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *g_pictures: Tensor | None) -> tuple:
+        *saved, color = ctx.saved_tensors
+        inputs, kept = saved[: -len(Kept._fields)], Kept(*saved[-len(Kept._fields) :])
+        world, _, _, colors, texels, attributes, _, _ = inputs
+        _, wants_matrix, wants_focal, wants_colors, wants_texels, wants_attributes, wants_light, wants_phong, _ = (
+            ctx.needs_input_grad
+        )
+        scene = ctx.scene
+        batch, count = world.shape[:2]
+        pixels = scene.height * scene.width
+        mesh, look, frames = _structs(inputs, scene, kept)
+        launch = _launcher(world)
+        g_colors = torch.zeros_like(colors) if wants_colors else colors.new_zeros(0, 3)
+        g_texels = torch.zeros_like(texels) if wants_texels else texels.new_zeros(0, 3)
+        g_attributes = torch.zeros_like(attributes) if wants_attributes else attributes.new_zeros(0, 0, 0)
+        sums, g_samples = world.new_zeros(_SLOTS, 8), torch.empty_like(kept.samples)
+        g = _Gradients()
+        g.vertices, g.normals, g.screen = (_array(torch.zeros_like(kept.vertices), wp.vec3) for _ in range(3))
+        g.colors, g.texels, g.attributes = _array(g_colors, wp.vec3), _array(g_texels, wp.vec3), _array(g_attributes)
+        g.samples, g.sums = _array(g_samples), _array(sums)
+        g.wants_sums = int(wants_focal or wants_light or wants_phong)
+        channels = kept.samples.shape[2]
+        shapes = (batch, 3, pixels), (batch, pixels), (batch, channels - 4, pixels), (batch, pixels)
+        g_color, g_mask, g_extras, g_inverse = (
+            _array(world.new_zeros([0] * len(shape)) if gradient is None else gradient.contiguous().view(shape))
+            for gradient, shape in zip(g_pictures[:4], shapes)
+        )
+        g_blended = _array(world.new_empty(batch, pixels, channels))
+        launch(
+            _encode_backward, (batch, pixels),
+            [look, frames, _array(color.view(batch, 3, pixels)), g_color, g_mask, g_extras, g, g_blended],
+        )  # fmt: skip
+        launch(_blend_backward, (batch, 2 * pixels), [mesh, look, frames, g_blended, g])
+        launch(_shade_backward, (batch, 3 * pixels), [mesh, look, frames, g_inverse, g])
+        launch(_unit_backward, (batch, count), [frames, g])
+        g_world, g_camera, g_focal = torch.empty_like(world), torch.empty_like(world), world.new_empty(batch, count)
+        launch(
+            _vertices_backward, (batch, count),
+            [mesh, look, frames, g, _array(g_camera, wp.vec3), _array(g_focal), _array(g_world, wp.vec3)],
+        )  # fmt: skip
+        g_matrix, total = None, sums.sum(0)
+        if wants_matrix:
+            turned = (g_camera[..., :, None] * world[..., None, :]).sum((0, 1))
+            g_matrix = torch.cat([turned, g_camera.sum((0, 1))[:, None]], 1)
+        return (
+            g_world,
+            g_matrix,
+            total[7] + g_focal.sum() if wants_focal else None,
+            g_colors if wants_colors else None,
+            g_texels if wants_texels else None,
+            g_attributes if wants_attributes else None,
+            total[:3] if wants_light else None,
+            total[3:7] if wants_phong else None,
+            None,
+        )
+
+
+def array(tensor: Tensor, dtype: torch.dtype) -> Tensor:
+    """As the kernels want what takes no gradient."""
+    return tensor.detach().to(dtype).contiguous()
+
+
+def topology(faces: Tensor, vertex_count: int) -> tuple[Tensor, ...]:
+    """The first five fields of `Mesh`; remembered for the last few `faces` tensors.
+
+    Raises:
+        ValueError: A face names a vertex that is not there.
+    """
+    return function.topology(faces, vertex_count, _topology)
+
+
+def _topology(faces: Tensor, edges: Tensor, neighbours: Tensor, vertex_count: int) -> tuple[Tensor, ...]:
+    corners = faces.flatten()
+    counts = torch.bincount(corners, minlength=vertex_count)
+    starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    incident = torch.argsort(corners, stable=True)
+    return tuple(array(tensor, torch.int32) for tensor in (faces, edges, neighbours, starts, incident))
+
+
+def _array(tensor: Tensor, kind: type | None = None) -> wp.array:
+    """The same memory, as Warp wants it."""
+    return wp.from_torch(tensor, dtype=kind, requires_grad=False)
+
+
+def _launcher(tensor: Tensor):
+    """wp.launch on the device of a tensor, there in the order of what torch does."""
+    if tensor.is_cuda:
+        stream = wp.stream_from_torch(torch.cuda.current_stream(tensor.device))
+        _load(str(stream.device))
+        return partial(wp.launch, stream=stream, record_tape=False)
+    _load("cpu")
+    return partial(wp.launch, device="cpu", record_tape=False)
+
+
+@contextmanager
+def _quiet():
+    """Warp reports on standard output, where results go."""
+    level = wp.config.log_level
+    wp.config.log_level = max(level, wp.LOG_WARNING)
+    try:
+        yield
+    finally:
+        wp.config.log_level = level
+
+
+@cache
+def _load(device: str) -> None:
+    """Compiles the kernels for a device, or finds them in Warp's cache; says so if it takes more than a moment."""
+    text = f"render: compiling for {device}, once; later starts take under a second"
+    notice = Timer(1.0, print, [text], {"file": sys.stderr})
+    notice.daemon = True
+    notice.start()
+    try:
+        with _quiet():
+            wp.load_module(sys.modules[__name__], device=device)
+    finally:
+        notice.cancel()
+
+
+def _structs(inputs: list[Tensor], scene: function.Scene, kept: Kept) -> tuple:
+    mesh, look, frames = _Mesh(), _Look(), _Frames()
+    arrays = scene.mesh._replace(levels=scene.mesh.levels.int())
+    for struct, tensors, kinds in ((mesh, arrays, _MESH_KINDS), (frames, kept, _KEPT_KINDS)):
+        for name, tensor, kind in zip(tensors._fields, tensors, kinds):
+            setattr(struct, name, _array(tensor, kind))
+    _, matrix, focal, colors, texels, attributes, light, phong = inputs
+    look.matrix, look.focal, look.light, look.phong = map(_array, (matrix, focal.view(1), light, phong))
+    look.colors, look.texels, look.attributes = _array(colors, wp.vec3), _array(texels, wp.vec3), _array(attributes)
+    look.background, look.axis = _array(scene.background), wp.vec2(*scene.axis)
+    look.height, look.width, look.has_normals = scene.height, scene.width, int(scene.with_normals)
+    return mesh, look, frames
+
+
+with _quiet():
+    wp.init()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import OrderedDict, deque
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -11,13 +12,15 @@ from itertools import pairwise
 from threading import Lock
 from typing import ClassVar
 
+import numba
 import numpy as np
 import torch
 from torch import Tensor
 
-from render.antialias import DEPTH_MARGIN, edges_of, neighbours_of
+from render.antialias import DEPTH_MARGIN, VALLEY, edges_of, neighbours_of
 from render.kernels import cpu
 from render.kernels.announce import announced
+from render.kernels.cpu import Mesh as Mesh
 from render.rasterize import NEAR
 
 CORES = os.cpu_count() or 1
@@ -27,12 +30,12 @@ CORES = os.cpu_count() or 1
 class Scene:
     """What is the same in every frame of a call and takes no gradient."""
 
-    mesh: cpu.Mesh
+    mesh: tuple  # the `Mesh` of the kernels; here and below arrays for `cpu`, tensors for `cuda`
     axis: tuple[float, float]  # column and row of the optical axis
-    background: np.ndarray  # linear
+    background: np.ndarray | Tensor  # linear
     height: int
     width: int
-    parts: np.ndarray | None  # (V,) int64
+    parts: np.ndarray | Tensor | None  # (V,) int64
     with_normals: bool
     with_depth: bool
 
@@ -69,16 +72,16 @@ class Fused(torch.autograd.Function):
         look, attributes = _look(inputs, scene), inputs[5]
         number = look.lens.dtype
         workspace = Workspace(batch, world.shape[1], 4 + extra_channels, scene, number)
-        kept, near, margin = workspace.memory.kept, number.type(NEAR), number.type(DEPTH_MARGIN)
+        kept, limits = workspace.memory.kept, tuple(map(number.type, (NEAR, DEPTH_MARGIN, VALLEY)))
         candidates, tiles = workspace.memory.candidates, tile_count(batch, height)
         world, pictures = inputs[0], (color.numpy(), mask.numpy(), extras.numpy())
         if tiles == 1:
-            spread(cpu.forward, batch, world.numpy(), mesh, look, attributes.numpy(), (near, margin), kept, candidates,
+            spread(cpu.forward, batch, world.numpy(), mesh, look, attributes.numpy(), limits, kept, candidates,
                    *pictures)  # fmt: skip
         else:
-            spread(cpu.forward_vertices, batch, world.numpy(), mesh, look, near, kept)
+            spread(cpu.forward_vertices, batch, world.numpy(), mesh, look, limits[0], kept)
             spread(cpu.forward_pixels, batch * tiles, tiles, mesh, look, attributes.numpy(), kept, candidates)
-            spread(cpu.forward_silhouettes, batch, mesh, look, attributes.numpy(), margin, kept)
+            spread(cpu.forward_silhouettes, batch, mesh, look, attributes.numpy(), limits, kept)
             spread(cpu.forward_encoding, batch * tiles, tiles, kept, *pictures)
         if not kept.finite.all():
             _report_not_finite(world)
@@ -170,7 +173,7 @@ class Memory:
             samples=empty((batch, pixels + crossings, channels), number),
             pair_img=empty((batch, 2, height, width), np.int32),
             places=empty((batch, crossings, 6), np.int32),
-            crossings=empty((batch, crossings, 3), number),
+            crossings=empty((batch, crossings, 2), number),
             mixed=empty((batch, crossings, 2, channels), number),
             counts=empty(batch, np.int64),
         )
@@ -242,22 +245,18 @@ def tile_count(batch: int, height: int) -> int:
 
 
 _pool: ThreadPoolExecutor | None = None
-_compiling = Lock()
 
 
 def spread(kernel, pieces: int, *arguments) -> None:
     """Run `kernel(worker, first, last, *arguments)` over all pieces on as many threads as torch uses."""
+    run = _machine_code(kernel, arguments)
     threads = min(_worker_count(), pieces)
-    if not kernel.signatures:
-        with _compiling, announced():
-            kernel(0, 0, pieces, *arguments)  # compiles once, not in every thread
-        return
     if threads <= 1:
-        kernel(0, 0, pieces, *arguments)
+        run(0, 0, pieces, *arguments)
         return
     # Small parts, the calling thread among those who take them: a core that is busy with something else takes fewer.
-    bounds = np.linspace(0, pieces, min(pieces, 4 * threads) + 1).round().astype(int).tolist()
-    parts = deque(pairwise(bounds))
+    count = min(pieces, 4 * threads)
+    parts = deque(pairwise(part * pieces // count for part in range(count + 1)))
 
     def work(worker: int) -> None:
         while True:
@@ -265,12 +264,34 @@ def spread(kernel, pieces: int, *arguments) -> None:
                 first, last = parts.popleft()
             except IndexError:
                 return
-            kernel(worker, first, last, *arguments)
+            run(worker, first, last, *arguments)
 
     helpers = [_workers().submit(work, worker) for worker in range(1, threads)]
     work(0)
     for helper in helpers:
         helper.result()
+
+
+_found: dict[tuple, Callable] = {}
+_compiling = Lock()
+
+
+def _machine_code(kernel, arguments: tuple) -> Callable:
+    """The kernel compiled for arguments of these types; numba's own look-up takes 60 us with tuples of arrays."""
+    key = (kernel, *map(_kind, arguments))
+    if key not in _found:
+        types = tuple(map(numba.typeof, (0, 0, 0, *arguments)))
+        with _compiling, announced():
+            kernel.compile(types)
+        _found[key] = kernel.overloads[types].entry_point
+    return _found[key]
+
+
+def _kind(value) -> tuple | type:
+    """What tells types of the kernels' arguments apart."""
+    if isinstance(value, tuple):
+        return tuple(map(_kind, value))
+    return (value.dtype.num, value.ndim, value.flags.num) if isinstance(value, np.ndarray) else type(value)
 
 
 def _worker_count() -> int:
@@ -292,32 +313,45 @@ def _forget_workers() -> None:
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_workers)  # threads do not survive a fork; the child starts its own
 
-_topologies: OrderedDict[int, tuple[Tensor, int, tuple[np.ndarray, np.ndarray, np.ndarray]]] = OrderedDict()
+
+def array(tensor: Tensor, dtype: torch.dtype) -> np.ndarray:
+    """As the kernels want what takes no gradient."""
+    return tensor.detach().to(dtype).contiguous().numpy()
 
 
-def topology(faces: Tensor, vertex_count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Faces, edges and neighbours as the kernels want them; remembered for the last few `faces` tensors.
+def _arrays(faces: Tensor, edges: Tensor, neighbours: Tensor, vertex_count: int) -> tuple[np.ndarray, ...]:
+    return tuple(array(tensor, torch.int32) for tensor in (faces, edges, neighbours))
+
+
+_topologies: OrderedDict[tuple, tuple[Tensor, int, tuple]] = OrderedDict()
+
+
+def topology(faces: Tensor, vertex_count: int, arrays: Callable[..., tuple] = _arrays) -> tuple:
+    """What `arrays` makes of faces, edges, neighbours and the number of vertices; remembered for the last few `faces`.
+
+    Without `arrays` it is the first three, as `cpu` wants them.
 
     Raises:
         ValueError: A face names a vertex that is not there.
     """
-    known = _topologies.get(id(faces))
+    key = id(faces), vertex_count, arrays
+    known = _topologies.get(key)
     # The tensor is kept, so its id is not given to another; _version counts changes in place.
-    if known is None or known[0] is not faces or known[1] != faces._version:
+    if known is None or known[0] is not faces or known[1] != _version(faces):
+        lowest, largest = (int(faces.min()), int(faces.max())) if len(faces) else (0, -1)
+        if lowest < 0 or largest >= vertex_count:
+            raise ValueError(
+                f"faces: expected vertex indices in 0..{vertex_count - 1}, got {lowest}..{largest}; "
+                "check that faces and vertices belong to the same mesh"
+            )
         edges = edges_of(faces)
-        known = (faces, faces._version, tuple(map(_indices, (faces, edges, neighbours_of(faces, edges)))))
-        _topologies[id(faces)] = known
+        known = faces, _version(faces), arrays(faces, edges, neighbours_of(faces, edges), vertex_count)
+        _topologies[key] = known
         while len(_topologies) > 16:
             _topologies.popitem(last=False)
-    face_array, edge_array, _ = known[2]
-    largest = int(edge_array[:, :2].max()) if len(edge_array) else -1
-    if largest >= vertex_count or (len(face_array) and int(face_array.min()) < 0):
-        raise ValueError(
-            f"faces: expected vertex indices in 0..{vertex_count - 1}, got {int(face_array.min())}..{largest}; "
-            "check that faces and vertices belong to the same mesh"
-        )
     return known[2]
 
 
-def _indices(tensor: Tensor) -> np.ndarray:
-    return np.ascontiguousarray(tensor.numpy(), dtype=np.int32)
+def _version(tensor: Tensor) -> int:
+    """Counts changes in place; tensors made for inference are not changed by anyone."""
+    return 0 if tensor.is_inference() else tensor._version
