@@ -228,8 +228,8 @@ def scene_accuracy(head: Head, pixels: int, kind: str, seed: int) -> dict[str, f
                 vertices, head.faces, camera, light, height=size, width=size, texture=texture, **arguments
             )["color"]  # fmt: skip
 
-    change = torch.randn(len(point), generator=generator).clamp(-2, 2)
-    return compare(draw, point, steps, point + 3 * steps * change, pixels)
+    target = point + 8 * steps * torch.randn(len(point), generator=generator)
+    return compare(draw, point, steps, target.abs() if kind == "light" else target, pixels)
 
 
 def face_accuracy(pixels: int, internal: int, region: str, seed: int) -> dict[str, float]:
