@@ -71,7 +71,9 @@ class Kept(NamedTuple):
     counts: np.ndarray  # (B,) crossings
 
 
-_APPROXIMATE = {"nnan", "ninf", "nsz", "arcp", "contract", "reassoc"}
+# Promises of finite numbers only. No arithmetic is reordered or contracted: which of several compiled copies of a
+# function a kernel is linked to depends on what was loaded first, and all copies have to agree to the last bit.
+_FAST = {"nnan", "ninf", "nsz"}
 
 
 def _compiled(function):
@@ -79,16 +81,9 @@ def _compiled(function):
     return numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
 
 
-def _exact(function):
-    """For arithmetic on finite numbers in which two faces must agree to the last bit."""
-    return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "ninf", "nsz"})(
-        inspect.unwrap(function)
-    )
-
-
 def _inlined(function):
-    """For arithmetic that may be reordered."""
-    return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_APPROXIMATE)(inspect.unwrap(function))
+    """For inner loops on finite numbers."""
+    return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)(inspect.unwrap(function))
 
 
 @_inlined
@@ -161,7 +156,7 @@ def _ceil(x):
     return whole + np.int32(whole < x)
 
 
-@_exact
+@_inlined
 def _classify(screen, faces, height, width, sides):
     """Which faces look this way, and which of them have a pixel centre between their outermost columns and rows.
 
@@ -187,7 +182,7 @@ def _classify(screen, faces, height, width, sides):
 _HITS = 1024  # pixels that lie inside a face are noted, and their depths compared so many at a time
 
 
-@_exact
+@_inlined
 def _nearest(pixels, owners, inverses, areas, count, inverse_img, face_img):
     for hit in range(count):
         inverses[hit] /= areas[hit]
@@ -198,7 +193,7 @@ def _nearest(pixels, owners, inverses, areas, count, inverse_img, face_img):
             face_img[pixel] = owners[hit]
 
 
-@_exact
+@_inlined
 def _rasterize(screen, faces, sides, candidates, first_row, last_row, face_img, inverse_img):
     """Which front face lies nearest in each pixel of some rows, and its inverse depth.
 
@@ -412,7 +407,7 @@ def _silhouettes(screen, mesh, sides, face_img, inverse_img, margin, pair_img, p
     return count
 
 
-@_exact
+@_inlined
 def _valleys(inverse_img, row, along, step, valleys):
     """Where the surface seen in a row may be a groove between a pixel and the next: its slope rises by `step` there.
 
@@ -785,12 +780,14 @@ def _power(block, count, shininess):
 
 
 @_inlined
-def _light_backward(phong, block, count, g_light, g_phong):
-    """Gradients of point, normal (not of unit length) and albedo from those of the colour and of the unit normal."""
+def _light_backward(phong, block, count):
+    """Gradients of point, normal (not of unit length) and albedo from those of the colour and of the unit normal.
+
+    Leaves what each sample adds to the gradients of the light in the places of what is not needed any more.
+    """
     number = block.dtype.type
     zero, two = number(0), number(2)
     diffuse, specular, shininess = phong[1], phong[2], phong[3]
-    g_x, g_y, g_z, g_ambient, g_diffuse, g_specular = zero, zero, zero, zero, zero, zero
     for m in range(count):
         g_red, g_green, g_blue = block[_G_RED + m], block[_G_GREEN + m], block[_G_BLUE + m]
         g_highlight = g_red + g_green + g_blue
@@ -800,9 +797,9 @@ def _light_backward(phong, block, count, g_light, g_phong):
         block[_G_RED + m] = g_red * factor
         block[_G_GREEN + m] = g_green * factor
         block[_G_BLUE + m] = g_blue * factor
-        g_ambient += g_factor
-        g_diffuse += g_factor * n_l
-        g_specular += g_highlight * power * r_v
+        block[_FACTOR + m] = g_factor
+        block[_N_L + m] = g_factor * n_l
+        block[_POWER + m] = g_highlight * power * r_v
         # factor = ambient + diffuse n.l, highlight = specular (r.v) ^ shininess, r.v = 2 n.l n.v - l.v.
         nx, ny, nz = block[_NX + m], block[_NY + m], block[_NZ + m]
         lx, ly, lz = block[_LX + m], block[_LY + m], block[_LZ + m]
@@ -827,15 +824,21 @@ def _light_backward(phong, block, count, g_light, g_phong):
         block[_G_PX + m] = -(g_lx + g_vx)
         block[_G_PY + m] = -(g_ly + g_vy)
         block[_G_PZ + m] = -(g_lz + g_vz)
-        g_x += g_lx
-        g_y += g_ly
-        g_z += g_lz
-    g_light[0] += g_x
-    g_light[1] += g_y
-    g_light[2] += g_z
-    g_phong[0] += g_ambient
-    g_phong[1] += g_diffuse
-    g_phong[2] += g_specular
+        block[_LX + m] = g_lx
+        block[_LY + m] = g_ly
+        block[_LZ + m] = g_lz
+
+
+@_inlined
+def _sum_light(block, count, g_light, g_phong):
+    """After `_light_backward`."""
+    for m in range(count):
+        g_light[0] += block[_LX + m]
+        g_light[1] += block[_LY + m]
+        g_light[2] += block[_LZ + m]
+        g_phong[0] += block[_FACTOR + m]
+        g_phong[1] += block[_N_L + m]
+        g_phong[2] += block[_POWER + m]
 
 
 @_inlined
@@ -1066,7 +1069,7 @@ def _take_gradient(g_samples, sample, has_normals, block, m):
 
 @_compiled
 def _shade_pixels_backward(
-    mesh, look, vertices, normals, attributes, face_img, first_row, last_row, wants_shininess, g_samples, g_inverse, g
+    mesh, look, vertices, normals, attributes, face_img, first_row, last_row, wants_light, g_samples, g_inverse, g
 ):  # fmt: skip
     faces, uv, uv_faces, uv_areas, levels = mesh.faces, mesh.uv, mesh.uv_faces, mesh.uv_areas, mesh.levels
     lens, light, phong, colors, texels = look.lens, look.light, look.phong, look.colors, look.texels
@@ -1104,9 +1107,11 @@ def _shade_pixels_backward(
             if m < LANES and not (row == last_row - 1 and column == width - 1):
                 continue
             _light(light, phong, block, m)
-            if wants_shininess:
+            if wants_light:
                 _shininess_backward(block, m, g_phong)
-            _light_backward(phong, block, m, g_light, g_phong)
+            _light_backward(phong, block, m)
+            if wants_light:
+                _sum_light(block, m, g_light, g_phong)
             for n in range(m):
                 sample = targets[n]
                 f = face_img[sample // width, sample % width]
@@ -1136,7 +1141,7 @@ def _shade_pixels_backward(
 
 @_compiled
 def _shade_crossings_backward(
-    mesh, look, vertices, screen, normals, attributes, places, crossings, count, first, width, wants_shininess,
+    mesh, look, vertices, screen, normals, attributes, places, crossings, count, first, width, wants_light,
     g_samples, g,
 ):  # fmt: skip
     faces, uv, uv_faces, uv_areas, levels = mesh.faces, mesh.uv, mesh.uv_faces, mesh.uv_areas, mesh.levels
@@ -1160,9 +1165,11 @@ def _shade_crossings_backward(
         if m < LANES and n < count - 1:
             continue
         _light(light, phong, block, m)
-        if wants_shininess:
+        if wants_light:
             _shininess_backward(block, m, g_phong)
-        _light_backward(phong, block, m, g_light, g_phong)
+        _light_backward(phong, block, m)
+        if wants_light:
+            _sum_light(block, m, g_light, g_phong)
         for lane in range(m):
             target = targets[lane]
             p, q, f, fraction = places[target, 0], places[target, 1], places[target, 2], crossings[target, 1]
@@ -1530,7 +1537,7 @@ def backward_encoding(worker, first, last, tiles, kept, color, g_color, g_mask, 
 
 
 @_compiled
-def backward_silhouettes(worker, first, last, tiles, mesh, look, attributes, wants_shininess, kept, scratch, sums):
+def backward_silhouettes(worker, first, last, tiles, mesh, look, attributes, wants_light, kept, scratch, sums):
     pixels, width = kept.face_img.shape[1] * kept.face_img.shape[2], kept.face_img.shape[2]
     for b in range(first, last):
         g = _gradients(sums, worker, tiles, b * tiles)
@@ -1541,21 +1548,19 @@ def backward_silhouettes(worker, first, last, tiles, mesh, look, attributes, wan
         )  # fmt: skip
         _shade_crossings_backward(
             mesh, look, kept.vertices[b], kept.screen[b], kept.normals[b], attributes[b], kept.places[b],
-            kept.crossings[b], kept.counts[b], pixels, width, wants_shininess, scratch.samples[slot], g,
+            kept.crossings[b], kept.counts[b], pixels, width, wants_light, scratch.samples[slot], g,
         )  # fmt: skip
 
 
 @_compiled
-def backward_pixels(
-    worker, first, last, tiles, mesh, look, attributes, wants_shininess, kept, g_inverse, scratch, sums
-):
+def backward_pixels(worker, first, last, tiles, mesh, look, attributes, wants_light, kept, g_inverse, scratch, sums):
     height = kept.face_img.shape[1]
     for piece in range(first, last):
         b, tile = piece // tiles, piece % tiles
         top, bottom = tile * height // tiles, (tile + 1) * height // tiles
         _shade_pixels_backward(
             mesh, look, kept.vertices[b], kept.normals[b], attributes[b], kept.face_img[b], top, bottom,
-            wants_shininess, scratch.samples[worker if tiles == 1 else b], g_inverse[b],
+            wants_light, scratch.samples[worker if tiles == 1 else b], g_inverse[b],
             _gradients(sums, worker, tiles, piece),
         )  # fmt: skip
 
@@ -1577,14 +1582,14 @@ def backward_vertices(worker, first, last, tiles, world, mesh, look, kept, sums,
 
 @_compiled
 def backward(
-    worker, first, last, world, mesh, look, attributes, wants_shininess, kept, color, g_color, g_mask, g_extras,
+    worker, first, last, world, mesh, look, attributes, wants_light, kept, color, g_color, g_mask, g_extras,
     g_inverse, scratch, sums, g_world, g_matrix,
 ):  # fmt: skip
     """Whole frames; what is not scratch memory starts at 0 in `sums` and `g_matrix`."""
     for b in range(first, last):
         backward_encoding(worker, b, b + 1, 1, kept, color, g_color, g_mask, g_extras, scratch, sums)
-        backward_silhouettes(worker, b, b + 1, 1, mesh, look, attributes, wants_shininess, kept, scratch, sums)
-        backward_pixels(worker, b, b + 1, 1, mesh, look, attributes, wants_shininess, kept, g_inverse, scratch, sums)
+        backward_silhouettes(worker, b, b + 1, 1, mesh, look, attributes, wants_light, kept, scratch, sums)
+        backward_pixels(worker, b, b + 1, 1, mesh, look, attributes, wants_light, kept, g_inverse, scratch, sums)
         backward_vertices(worker, b, b + 1, 1, world, mesh, look, kept, sums, g_world, g_matrix)
 
 

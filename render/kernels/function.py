@@ -128,7 +128,7 @@ class Fused(torch.autograd.Function):
         g_color, g_mask, g_extras, g_inverse = (
             nothing if gradient is None else gradient.contiguous().numpy() for gradient in g_pictures[:4]
         )
-        shared = scene.mesh, look, attributes.numpy(), wants_phong, kept
+        shared = scene.mesh, look, attributes.numpy(), wants_light or wants_phong, kept
         if tiles == 1:
             spread(cpu.backward, batch, world.numpy(), *shared, color.numpy(), g_color, g_mask, g_extras, g_inverse,
                    scratch, sums, g_world.numpy(), g_matrix)  # fmt: skip
