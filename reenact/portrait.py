@@ -135,9 +135,9 @@ def fit_weights(
 ) -> Float[Tensor, "1 K"]:
     """Weights with which the rig looks like a picture of it, by gradient descent through the renderer.
 
-    Of 13 random expressions of anny:man at 128 pixels, 12 end within 0.1 % of the motion, in 2.5 s on two cores; the
-    other one ends in another expression that looks nearly alike (ours). Absolute differences do it; from squares only
-    every third arrives.
+    Of 10 random expressions of anny:man at 128 pixels, 9 end within 0.1 % of the motion, in 2.5 s on two cores; the
+    other one ends in another expression that looks nearly alike (ours). Absolute differences do it; with squared ones
+    none of three arrived.
 
     Args:
         portrait: Took the picture.
