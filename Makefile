@@ -66,5 +66,4 @@ lint: $(READY)
 
 bench: $(READY)
 	@mkdir -p runs/bench
-	@set -e; for script in benchmarks/renderer.py; do \
-		echo "$$script"; $(BIN)/python "$$script" --json "runs/bench/$$(basename "$$script" .py).json"; done
+	@$(BIN)/python benchmarks/renderer.py --json runs/bench/renderer.json

@@ -116,11 +116,6 @@ class Head:
             colors=self.colors, background=(0.2, 0.25, 0.35), buffers=buffers,
         )  # fmt: skip
 
-    def render_supersampled(self, weights: Tensor, pixels: int, samples: int = 8) -> Tensor:
-        """(B, 3, pixels, pixels): the mean light of samples x samples points in each pixel, in sRGB."""
-        fine = self.render(weights, pixels * samples, ("color",))["color"]
-        return srgb_from_linear(torch.nn.functional.avg_pool2d(linear_from_srgb(fine), samples))
-
 
 def supersampled(picture: Tensor, samples: int) -> Tensor:
     """The mean light of samples x samples points of an sRGB picture (B, 3, H, W) as one, in sRGB."""

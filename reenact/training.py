@@ -110,7 +110,7 @@ def train(config: Config, resume: bool = False) -> Path:
         SystemExit: SIGTERM, likewise saved; status 143.
     """
     console = Console(markup=False, highlight=False, emoji=False)  # a folder may look like markup
-    # Before the layout is found: sums of several threads end in other bits from time to time.
+    # Already for the layout, which sums of several threads would end in other bits from time to time.
     torch.set_num_threads(config.training.threads or torch.get_num_threads())
     with console.status("Reading rigs, finding the layout"):
         run = Run.open(Path(config.run or "")) if resume else Run.create(config)
