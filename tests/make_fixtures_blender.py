@@ -215,7 +215,7 @@ def export_obj(things):
             export_materials=shape == "neutral",
             export_normals=False,
             export_uv=shape == "neutral",
-            path_mode="RELATIVE",
+            path_mode="COPY",
         )
     for thing, action in actions.items():
         thing.data.shape_keys.animation_data.action = action
