@@ -15,7 +15,7 @@ from PIL import Image
 
 from reenact.errors import ReenactError
 from reenact.rigs.clip import Clip
-from reenact.rigs.formats import disk, gltf
+from reenact.rigs.formats import disk, gltf, gltf_document, gltf_write, pieces
 from reenact.rigs.rig import PARTS, Rig
 
 SHARED = Path(__file__).parents[2] / "shared"
@@ -93,7 +93,7 @@ def make_clip(rig: Rig, frames: int = 12, fps: float = 30.0) -> Clip:
 def test_what_is_written_comes_back_and_writes_the_same_bytes(seed, tmp_path):
     rig = make_random_rig(seed)
     clip = make_clip(rig, fps=(30.0, 24.0, 60.0, 29.97)[seed % 4])
-    gltf.save(rig, tmp_path / "one.glb", clip)
+    gltf_write.save(rig, tmp_path / "one.glb", clip)
     again, clip_again = gltf.load(tmp_path / "one.glb"), gltf.load_clip(tmp_path / "one.glb")
     assert (again.name, again.names, clip_again.names, clip_again.fps) == (rig.name, rig.names, rig.names, clip.fps)
     for field in ("neutral", "deltas", "faces", "parts"):
@@ -107,9 +107,9 @@ def test_what_is_written_comes_back_and_writes_the_same_bytes(seed, tmp_path):
         assert torch.equal(again.uv[again.uv_faces], rig.uv[rig.uv_faces])
     if rig.texture is not None:
         torch.testing.assert_close(again.texture, rig.texture, rtol=0, atol=1e-7)  # whole 255ths
-    gltf.save(again, tmp_path / "two.glb", clip_again)
+    gltf_write.save(again, tmp_path / "two.glb", clip_again)
     thrice = gltf.load(tmp_path / "two.glb")
-    gltf.save(thrice, tmp_path / "three.glb", clip_again)
+    gltf_write.save(thrice, tmp_path / "three.glb", clip_again)
     assert (tmp_path / "two.glb").read_bytes() == (tmp_path / "three.glb").read_bytes()
 
 
@@ -118,7 +118,7 @@ def test_coincident_vertices_of_our_own_stay_apart(tmp_path):
     neutral, deltas = rig.neutral.clone(), rig.deltas.clone()
     neutral[7], deltas[:, 7] = neutral[8], deltas[:, 8]
     twin = Rig("twin", neutral, deltas, rig.names, rig.faces)
-    gltf.save(twin, tmp_path / "twin.glb")
+    gltf_write.save(twin, tmp_path / "twin.glb")
     assert torch.equal(gltf.load(tmp_path / "twin.glb").faces, twin.faces)
 
 
@@ -186,8 +186,10 @@ def test_meshes_that_share_names_become_one_rig_with_parts_and_colours(tmp_path)
     head["primitives"][0]["material"] = 0
     material = {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.25, 1.0, 1.0]}}
     nodes = [{"mesh": 0}, {"mesh": 1, "translation": [0, 0, 3]}, {"mesh": 2}]
-    with pytest.warns(UserWarning, match="without shapes are left out: shirt"):
-        loaded = load(tmp_path, builder.root([head, teeth, shirt], nodes, materials=[material]), builder.binary)
+    root = builder.root([head, teeth, shirt], nodes, materials=[material])
+    loaded = load(tmp_path, root, builder.binary)
+    left = [mesh for mesh in gltf.read(tmp_path / "made.glb")[1].meshes if not mesh.used]
+    assert [(mesh.name, mesh.reason) for mesh in left] == [("shirt", "no shapes")]
     assert loaded.names == ("smile", "open")
     assert len(loaded.neutral) == 8
     assert loaded.deltas[0, 4:].abs().sum() == 0
@@ -214,7 +216,7 @@ def test_meshes_that_share_names_become_one_rig_with_parts_and_colours(tmp_path)
     ],
 )
 def test_parts_follow_from_names(label, part):
-    assert PARTS[gltf._part(label)] == part
+    assert PARTS[pieces.part_named(label)] == part
 
 
 @pytest.mark.parametrize("with_view", [False, True])
@@ -267,11 +269,186 @@ def test_lines_are_no_part_of_a_rig(tmp_path):
     assert len(load(tmp_path, builder.root([mesh], [{"mesh": 0}]), builder.binary).faces) == 2
 
 
-def test_a_skin_is_left_out_with_a_warning_and_without_its_node(tmp_path):
+def skinned(builder: Builder, poses: list[np.ndarray]) -> dict:
+    """A square whose first two vertices hang on one joint, the others on a second; joints were bound at +x and +y."""
+    bound = [np.eye(4), np.eye(4)]
+    bound[0][0, 3], bound[1][1, 3] = 1, 1
+    inverse = np.stack([np.linalg.inv(each).T.reshape(16) for each in bound]).astype("<f4")
+    mesh = square(
+        builder,
+        JOINTS_0=builder.add(np.array([[0, 0, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]], "<u1"), "VEC4"),
+        WEIGHTS_0=builder.add(np.tile(np.array([[1, 0, 0, 0]], "<f4"), (4, 1)), "VEC4"),
+    )
+    joints = [{"matrix": (pose @ each).T.reshape(16).tolist()} for pose, each in zip(poses, bound)]
+    skin = {"joints": [1, 2], "inverseBindMatrices": builder.add(inverse, "MAT4")}
+    return builder.root([mesh], [{"mesh": 0, "skin": 0, "scale": [9, 9, 9]}, *joints], skins=[skin])
+
+
+def test_a_skin_at_its_bind_pose_stands_where_its_joints_stand_and_not_its_node(tmp_path):
     builder = Builder()
-    root = builder.root([square(builder)], [{"mesh": 0, "skin": 0, "scale": [9, 9, 9]}])
-    with pytest.warns(UserWarning, match="skins are not applied to: face"):
-        assert load(tmp_path, root, builder.binary).neutral.max() == 1
+    larger = np.diag([2.0, 2.0, 2.0, 1.0])  # an armature in other units
+    loaded = load(tmp_path, skinned(builder, [larger, larger]), builder.binary)
+    np.testing.assert_allclose(loaded.neutral, 2 * SQUARE, atol=1e-6)
+    np.testing.assert_allclose(loaded.deltas[0], 2 * PUSH, atol=1e-6)
+
+
+def test_a_posed_skin_keeps_its_bound_shape_at_the_joint_that_carries_the_motion(tmp_path):
+    builder = Builder()
+    nod, other = np.eye(4), np.eye(4)
+    nod[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # a quarter turn about x
+    other[:3, 3] = 5
+    loaded = load(tmp_path, skinned(builder, [nod, other]), builder.binary)  # vertex 0, on the first, moves most
+    np.testing.assert_allclose(loaded.neutral, SQUARE @ nod[:3, :3].T, atol=1e-6)
+
+
+def test_meshes_are_chosen_by_name_and_shapes_too(tmp_path):
+    builder = Builder()
+    head, shirt = square(builder, ("smile", "jawOpen", "jawLeft")), square(builder, ("wrinkle",))
+    shirt["name"] = "Shirt"
+    path = tmp_path / "made.glb"
+    path.write_bytes(pack(builder.root([head, shirt], [{"mesh": 0}, {"mesh": 1}]), builder.binary))
+    assert gltf.load(path).names == ("smile", "jawOpen", "jawLeft", "wrinkle")
+    chosen = gltf.load(path, pieces.Choice(parts=("fa*",), shapes=("JAW*",)))
+    assert (chosen.names, len(chosen.neutral)) == (("jawOpen", "jawLeft"), 4)
+    with pytest.raises(ReenactError, match="no mesh is called hair; it has face, Shirt"):
+        gltf.load(path, pieces.Choice(parts=("hair",)))
+    with pytest.raises(ReenactError, match="no shape is called wink; it has smile"):
+        gltf.load(path, pieces.Choice(shapes=("wink",)))
+
+
+def test_eyes_without_shapes_are_taken_where_they_lie_in_the_face(tmp_path):
+    builder = Builder()
+    meshes = [square(builder) for _ in range(4)]
+    for mesh, name in zip(meshes[1:], ("Eyes", "Eyes of a poster", "Hair")):
+        mesh["name"] = name
+        del mesh["primitives"][0]["targets"], mesh["extras"]
+    small = {"scale": [0.3, 0.3, 0.3], "translation": [-0.15, 0.3, 0]}  # shapes move the left edge of the square
+    nodes = [{"mesh": 0}, {"mesh": 1, **small}, {"mesh": 2, "translation": [30, 0, 0]}, {"mesh": 3, **small}]
+    path = tmp_path / "made.glb"
+    path.write_bytes(pack(builder.root(meshes, nodes), builder.binary))
+    rig, contents = gltf.read(path)
+    assert {mesh.name: mesh.reason for mesh in contents.meshes} == {
+        "face": "has shapes",
+        "Eyes": "lies in the face",
+        "Eyes of a poster": "no shapes",
+        "Hair": "no shapes",
+    }
+    assert len(rig.part("eyes")) == 4
+
+
+def vrm(version: str, **expressions: list[tuple[int, int, float]]) -> dict:
+    """Extensions of a file whose expressions mix morph targets (mesh and node, target, weight from 0 to 1)."""
+    if version == "1.0":
+        custom = {
+            name: {"morphTargetBinds": [{"node": node, "index": k, "weight": weight} for node, k, weight in binds]}
+            for name, binds in expressions.items()
+        }
+        return {"VRMC_vrm": {"specVersion": "1.0", "expressions": {"custom": custom}}}
+    groups = [
+        {
+            "name": name,
+            "presetName": "unknown",
+            "binds": [{"mesh": m, "index": k, "weight": 100 * w} for m, k, w in binds],
+        }
+        for name, binds in expressions.items()
+    ]
+    return {"VRM": {"blendShapeMaster": {"blendShapeGroups": groups}}}
+
+
+@pytest.mark.parametrize("version", ["0.x", "1.0"])
+def test_expressions_of_vrm_are_shapes_that_mix_others(version, tmp_path):
+    builder = Builder()
+    face, lashes = square(builder, ("smile", "open")), square(builder, ("close",))
+    lashes["name"] = "lashes"
+    extensions = vrm(version, happy=[(0, 0, 0.5), (0, 1, 0.25), (1, 0, 1.0)], smile=[(0, 0, 1.0)], a=[(0, 1, 1.0)])
+    path = tmp_path / "made.vrm"
+    path.write_bytes(
+        pack(builder.root([face, lashes], [{"mesh": 0}, {"mesh": 1}], extensions=extensions), builder.binary)
+    )
+    rig, contents = gltf.read(path)
+    assert rig.names == ("smile", "open", "happy", "close")
+    torch.testing.assert_close(rig.deltas[2, :4], torch.from_numpy(0.75 * PUSH))
+    torch.testing.assert_close(rig.deltas[2, 4:], torch.from_numpy(PUSH))
+    assert contents.format.startswith(f"VRM {version}")
+    assert "expression a is the shape open" in contents.converted
+    assert gltf.load(path, pieces.Choice(shapes=("a", "smile"))).names == ("smile", "a")
+
+
+def test_an_avatar_keeps_everything_and_gains_the_animation(tmp_path):
+    builder = Builder()
+    face, lashes = square(builder, ("smile", "open")), square(builder, ("open",))
+    extensions = vrm("1.0", happy=[(0, 0, 0.5), (1, 0, 1.0)])
+    root = builder.root([face, lashes], [{"mesh": 0}, {"mesh": 1}], extensions=extensions, extensionsUsed=["VRMC_vrm"])
+    (tmp_path / "avatar.vrm").write_bytes(pack(root, builder.binary))
+    clip = Clip(("happy", "open", "wink"), torch.tensor([[1.0, 0.5, 1.0], [0.0, 1.0, 0.0]]), 25.0)
+    lost = gltf_write.animate(tmp_path / "avatar.vrm", clip, tmp_path / "moved.vrm")
+    assert lost == ("wink",)
+    after, _ = unpack((tmp_path / "moved.vrm").read_bytes())
+    for key in ("extensions", "extensionsUsed", "meshes", "nodes"):
+        assert after[key] == root[key]
+    moved = gltf.load_clip(tmp_path / "moved.vrm")
+    assert (moved.names, moved.fps) == (("smile", "open"), 25.0)
+    # Half a smile from happy; `open` as the first mesh has it, where happy does not move it.
+    assert moved.weights.tolist() == [[0.5, 0.5], [0.0, 1.0]]
+    assert len(after["animations"][0]["channels"]) == 2
+
+
+def test_buffers_beside_an_avatar_move_into_the_file(tmp_path):
+    builder = Builder()
+    root = builder.root([square(builder)], [{"mesh": 0}])
+    root["buffers"][0]["uri"] = "side.bin"
+    (tmp_path / "side.bin").write_bytes(builder.binary)
+    (tmp_path / "avatar.gltf").write_text(json.dumps(root))
+    clip = Clip(("smile",), torch.rand(3, 1), 30.0)
+    gltf_write.animate(tmp_path / "avatar.gltf", clip, tmp_path / "moved.glb")
+    (tmp_path / "side.bin").unlink()
+    assert torch.equal(gltf.load_clip(tmp_path / "moved.glb").weights, clip.weights)
+    assert gltf.load(tmp_path / "moved.glb").names == ("smile",)
+
+
+def test_an_avatar_without_the_shapes_of_a_clip_is_refused(tmp_path):
+    builder = Builder()
+    (tmp_path / "a.glb").write_bytes(pack(builder.root([square(builder)], [{"mesh": 0}]), builder.binary))
+    with pytest.raises(ReenactError, match="expected some of the clip's shapes"):
+        gltf_write.animate(tmp_path / "a.glb", Clip(("wink",), torch.ones(1, 1), 30.0), tmp_path / "b.glb")
+
+
+def test_animations_of_several_meshes_are_one_clip(tmp_path):
+    builder = Builder()
+    meshes = [square(builder, ("smile",)), square(builder, ("open",)), square(builder, ("smile",))]
+    times = builder.add(np.array([0.0, 0.04, 0.08], "<f4"), "SCALAR")
+
+    def action(node, *values):
+        output = builder.add(np.array(values, "<f4"), "SCALAR")
+        channel = {"sampler": 0, "target": {"node": node, "path": "weights"}}
+        return {"samplers": [{"input": times, "output": output}], "channels": [channel]}
+
+    animations = [action(0, 0, 0.5, 1), action(1, 1, 0.5, 0), action(0, 1, 1, 1)]  # the third is another take
+    path = tmp_path / "made.glb"
+    path.write_bytes(pack(builder.root(meshes, [{"mesh": i} for i in range(3)], animations=animations), builder.binary))
+    clip = gltf.load_clip(path)
+    assert (clip.names, clip.fps) == (("smile", "open"), 25.0)
+    np.testing.assert_allclose(clip.weights, [[0, 1], [0.5, 0.5], [1, 0]], atol=1e-6)  # float32 times
+
+
+def test_faces_that_are_mostly_transparent_are_left_out(tmp_path):
+    builder = Builder()
+    uv = builder.add(np.array([[0.1, 0.5], [0.4, 0.5], [0.9, 0.5], [0.6, 0.5]], "<f4"), "VEC2")
+    mesh = square(builder, TEXCOORD_0=uv)
+    mesh["primitives"][0] |= {"material": 0, "indices": builder.add(np.array([0, 1, 1, 2, 3, 3], "<u2"), "SCALAR")}
+    clear = np.full((2, 2, 4), 255, np.uint8)
+    clear[:, 1, 3] = 20  # the right half
+    packed = io.BytesIO()
+    Image.fromarray(clear).save(packed, "PNG")
+    uri = "data:image/png;base64," + base64.b64encode(packed.getvalue()).decode()
+    surface = {"alphaMode": "MASK", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
+    more = {"materials": [surface], "textures": [{"source": 0}], "images": [{"uri": uri}]}
+    mesh["primitives"].append({**mesh["primitives"][0], "indices": builder.add(np.array([0, 1, 3], "<u2"), "SCALAR")})
+    mesh["primitives"][1].pop("material")
+    path = tmp_path / "made.glb"
+    path.write_bytes(pack(builder.root([mesh], [{"mesh": 0}], **more), builder.binary))
+    _, contents = gltf.read(path)
+    assert "face: 1 transparent of 2 faces left out" in contents.converted
 
 
 def png(color) -> bytes:
@@ -280,7 +457,7 @@ def png(color) -> bytes:
     return packed.getvalue()
 
 
-def test_several_pictures_become_vertex_colours(tmp_path):
+def test_several_pictures_become_one(tmp_path):
     builder = Builder()
     meshes = []
     for _ in range(2):
@@ -291,9 +468,11 @@ def test_several_pictures_become_vertex_colours(tmp_path):
     surface = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": index}}} for index in range(2)]
     more = {"materials": surface, "textures": [{"source": 0}, {"source": 1}], "images": [{"uri": uri} for uri in uris]}
     loaded = load(tmp_path, builder.root(meshes, [{"mesh": 0}, {"mesh": 1}], **more), builder.binary)
-    assert loaded.texture is None
-    np.testing.assert_allclose(loaded.colors[0], [1, 0, 0], atol=1e-6)  # sRGB to linear and back
-    np.testing.assert_allclose(loaded.colors[4], [0, 0.2, 0], atol=1e-6)
+    size = len(loaded.texture)
+    places = (loaded.uv[loaded.faces if loaded.uv_faces is None else loaded.uv_faces] * size).long()
+    seen = loaded.texture[places[..., 1], places[..., 0]]  # (F, 3, 3)
+    assert torch.equal(seen[:2], torch.tensor([1.0, 0.0, 0.0]).expand(2, 3, 3))
+    torch.testing.assert_close(seen[2:], torch.tensor([0.0, 0.2, 0.0]).expand(2, 3, 3), rtol=0, atol=1e-7)
 
 
 def test_a_texture_transform_moves_uv(tmp_path):
@@ -419,14 +598,14 @@ def test_keys_that_cannot_be_are_refused(times, values, kind, message, tmp_path)
 
 
 def test_a_file_without_animation_is_no_clip(tmp_path):
-    gltf.save(make_random_rig(1), tmp_path / "still.glb")
+    gltf_write.save(make_random_rig(1), tmp_path / "still.glb")
     with pytest.raises(ReenactError, match="expected an animation of morph weights, got none"):
         gltf.load_clip(tmp_path / "still.glb")
 
 
 def test_a_clip_of_another_rig_is_not_written(tmp_path):
     with pytest.raises(ReenactError, match="conform it first"):
-        gltf.save(make_random_rig(1), tmp_path / "x.glb", Clip(("a",), torch.zeros(2, 1), 30.0))
+        gltf_write.save(make_random_rig(1), tmp_path / "x.glb", Clip(("a",), torch.zeros(2, 1), 30.0))
     assert not list(tmp_path.iterdir())
 
 
@@ -447,22 +626,20 @@ def change(*path_and_value):
 HOSTILE = {
     "old version": (change("asset", "version", "1.0"), "expected glTF 2.0, got version 1.0"),
     "asset missing": (change("asset", None), "asset as an object"),
-    "draco": (change("extensionsRequired", ["KHR_draco_mesh_compression"]), "export it without Draco compression"),
-    "meshopt": (change("extensionsRequired", ["EXT_meshopt_compression"]), "export it without meshopt compression"),
     "unknown extension": (change("extensionsRequired", ["ACME_magic", 7]), "not supported: ACME_magic, 7"),
     "packed view": (
         lambda root: (
             root["bufferViews"][0].update(buffer=1, extensions={"EXT_meshopt_compression": {}})
             or root["buffers"].append({"byteLength": 9})
         ),
-        "packed with EXT_meshopt_compression",
+        "EXT_meshopt_compression.buffer, it is missing",
     ),
     "packed primitive": (
         lambda root: (
             root["meshes"][0]["primitives"][0].update(extensions={"KHR_draco_mesh_compression": {}})
             or root["accessors"][0].pop("bufferView")
         ),
-        "packed with KHR_draco_mesh_compression",
+        "KHR_draco_mesh_compression.bufferView among",
     ),
     "no names": (lambda root: root["meshes"][0].pop("extras"), "name the shapes before exporting"),
     "names as numbers": (change("meshes", 0, "extras", "targetNames", [1, 2, 3]), "named morph targets"),
@@ -523,7 +700,7 @@ HOSTILE = {
 @pytest.fixture(scope="module")
 def sample(tmp_path_factory) -> bytes:
     path = tmp_path_factory.mktemp("glb") / "sample.glb"
-    gltf.save(make_random_rig(7), path, make_clip(make_random_rig(7)))
+    gltf_write.save(make_random_rig(7), path, make_clip(make_random_rig(7)))
     return path.read_bytes()
 
 

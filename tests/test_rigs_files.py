@@ -65,7 +65,7 @@ def test_built_in_characters_are_named():
 
 
 BAD_RIGS = {
-    "face.fbx": "expected a rig, one of .glb",
+    "face.max": "expected a rig, one of .npz, .glb",
     "face": "no suffix",
     "face.glb": "no such file",
     "a\0.glb": "no such",
@@ -95,18 +95,18 @@ def test_rigs_and_clips_are_not_mistaken_for_each_other(tmp_path):
 
 
 def test_a_folder_is_no_file(tmp_path):
-    (tmp_path / "x.glb").mkdir()
+    (tmp_path / "x.csv").mkdir()
     with pytest.raises(ReenactError, match="expected a file, found a folder"):
-        files.load_rig(str(tmp_path / "x.glb"))
+        files.read_clip(tmp_path / "x.csv")
 
 
 def test_what_cannot_be_written_is_explained(tmp_path):
     rig = make_random_rig(1)
     clip = Clip(rig.names, torch.zeros(1, 3), 30.0)
     for save, message in (
-        (lambda: files.save_rig(rig, tmp_path / "x.obj"), "a rig is written as .glb or .npz, got .obj"),
+        (lambda: files.save_rig(rig, tmp_path / "x.mtl"), "a rig is written as .glb, .npz, .*got .mtl"),
         (lambda: files.save_rig(rig, tmp_path / "x.npz", clip), "not both"),
-        (lambda: files.save_clip(clip, tmp_path / "x.mp4"), "a clip is written as .csv, .npz or .glb, got .mp4"),
+        (lambda: files.save_clip(clip, tmp_path / "x.mp4"), "a clip is written as .csv, .npz, .json, .*got .mp4"),
         (lambda: files.save_clip(clip, tmp_path / "x.glb"), "needs the rig"),
         (lambda: files.save_rig(rig, tmp_path / "nowhere" / "x.glb"), "cannot be written .* choose a folder"),
     ):

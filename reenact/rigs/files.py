@@ -5,66 +5,108 @@ from __future__ import annotations
 import difflib
 import warnings
 from collections.abc import Iterable
+from importlib import import_module
 from pathlib import Path
-
-import torch
+from types import ModuleType
 
 from reenact.errors import ReenactError
 from reenact.rigs import arkit, motion
 from reenact.rigs.clip import Clip
-from reenact.rigs.formats import gltf, livelink, npz, table
+from reenact.rigs.formats import npz
+from reenact.rigs.formats.pieces import DEFAULT, Choice, Contents, reduced
+from reenact.rigs.matching import conform
 from reenact.rigs.rig import Rig
 
-RIG_SUFFIXES = (".glb", ".gltf", ".npz")
+_GLTF, _USD = (".glb", ".gltf", ".vrm"), (".usd", ".usda", ".usdc", ".usdz")
+_MODULES = {".npz": "npz", **dict.fromkeys(_GLTF, "gltf"), **dict.fromkeys(_USD, "usd"), ".fbx": "fbx", ".obj": "obj"}
+"""Module of `formats` that reads rigs with a suffix; a folder holds .obj files."""
+
+RIG_SUFFIXES = tuple(_MODULES)
 """Files that `load_rig` reads."""
 
-CLIP_SUFFIXES = (".csv", ".npz", ".glb", ".gltf")
+CLIP_SUFFIXES = (".csv", ".npz", ".json", *_GLTF, *_USD, ".fbx")
 """Files that `load_clip` reads."""
 
+SAVED_RIGS = (".glb", ".npz", *_USD, ".obj")
+"""Files that `save_rig` writes; .obj a folder of them."""
 
-def load_rig(name_or_path: str) -> Rig:
-    """A built-in character such as `anny:man`, or the rig in a file.
+SAVED_CLIPS = (".csv", ".npz", ".json", ".glb", ".vrm", *_USD, ".py")
+"""Files that `save_clip` writes."""
+
+
+def load_rig(name_or_path: str, choice: Choice = DEFAULT) -> Rig:
+    """A built-in character such as `anny:man`, or the rig in a file or a folder of .obj files.
+
+    Warns of meshes of the file that are left out; `choice` takes others.
 
     Raises:
         ReenactError: No such character or file, an unknown suffix, or a file that cannot be read as a rig.
+    """
+    rig, contents = read_rig(name_or_path, choice)
+    left = [mesh.name for mesh in contents.meshes if not mesh.used]
+    if left and choice == DEFAULT:
+        warnings.warn(
+            f"{name_or_path}: meshes without shapes are left out: {', '.join(left)[:300]}; choose others by --parts",
+            stacklevel=2,
+        )
+    return rig
+
+
+def read_rig(name_or_path: str, choice: Choice = DEFAULT) -> tuple[Rig, Contents]:
+    """The rig of `load_rig`, and what its file holds.
+
+    Raises:
+        ReenactError: As `load_rig`.
     """
     if name_or_path.startswith("anny:"):
         from reenact.rigs import anny  # heavy, and only some commands build characters
 
         if name_or_path not in anny.BUILT_IN:
             raise ReenactError(f"{name_or_path}: no such character{_nearest(name_or_path, anny.BUILT_IN)}")
-        return anny.build(name_or_path)
+        return reduced(anny.build(name_or_path), choice, "built-in character")
+    path = Path(name_or_path)
+    if path.is_dir():
+        return _module("obj").read(path, choice)
     path = _existing(name_or_path, RIG_SUFFIXES, "rig")
-    if path.suffix.lower() != ".npz":
-        return gltf.load(path)
-    if "weights" in npz.contents(path):
-        raise ReenactError(f"{path}: expected a rig, found a clip (it has weights); give it where a clip is asked for")
-    return npz.load(path)
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        if "weights" in npz.contents(path):
+            raise ReenactError(
+                f"{path}: expected a rig, found a clip (it has weights); give it where a clip is asked for"
+            )
+        return reduced(npz.load(path), choice, "Reenact's own arrays")
+    return _module(_MODULES[suffix]).read(path, choice)
 
 
 def save_rig(rig: Rig, path: str | Path, clip: Clip | None = None) -> None:
-    """Writes the rig as .glb, there with the clip as its animation if one is given, or as .npz.
+    """Writes the rig as .glb or USD, there with the clip as its animation if one is given, as .npz, or as a folder of
+    .obj files.
 
     Raises:
-        ReenactError: Another suffix, a clip with .npz, a clip for other shapes, or the file cannot be written.
+        ReenactError: Another suffix, a clip with .npz or .obj, a clip for other shapes, or the file cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() == ".glb":
-        gltf.save(rig, path, None if clip is None else conform(clip, rig))
-    elif path.suffix.lower() == ".npz":
-        if clip is not None:
-            raise ReenactError(f"{path}: .npz holds a rig or a clip, not both; write a .glb")
+    suffix = path.suffix.lower()
+    moved = None if clip is None else conform(clip, rig)
+    if suffix in (".glb", *_USD):
+        _module("gltf_write" if suffix == ".glb" else "usd").save(rig, path, moved)
+    elif clip is not None and suffix in (".npz", ".obj", ""):
+        raise ReenactError(f"{path}: {suffix or 'a folder'} holds a rig or a clip, not both; write a .glb")
+    elif suffix == ".npz":
         npz.save(rig, path)
+    elif suffix == ".obj" or path.is_dir():
+        _module("obj").save(rig, path.with_suffix("") if suffix else path)
     else:
-        raise ReenactError(f"{path}: a rig is written as .glb or .npz, got {path.suffix or 'no suffix'}")
+        raise ReenactError(f"{path}: a rig is written as {', '.join(SAVED_RIGS)}, got {suffix or 'no suffix'}")
 
 
 def load_clip(text: str, rig: Rig) -> Clip:
     """The clip with the rig's shapes, in the rig's order; see `conform`.
 
     Args:
-        text: A file (.csv of Live Link Face or a table, .npz, .glb or .gltf with animation), or
-            `synthetic:SEED[:SECONDS[:KIND]]` for motion made by `motion.synthesize`, 20 seconds of "mixed" unless said.
+        text: A file (.csv of Live Link Face or a table; .json of Audio2Face or a table; .npz; .glb, .gltf, .vrm, .fbx
+            or USD with animation), or `synthetic:SEED[:SECONDS[:KIND]]` for motion made by `motion.synthesize`, 20
+            seconds of "mixed" unless said.
         rig: Whose shapes the clip is to have.
 
     Raises:
@@ -85,74 +127,58 @@ def read_clip(path: str | Path) -> Clip:
     return _read_clip(_existing(str(path), CLIP_SUFFIXES, "clip"))
 
 
-def save_clip(clip: Clip, path: str | Path, rig: Rig | None = None) -> None:
-    """Writes the clip as .csv, .npz, or together with its rig as .glb.
+def save_clip(clip: Clip, path: str | Path, rig: Rig | None = None, avatar: str | None = None) -> None:
+    """Writes the clip, or the clip together with the rig that it moves, by the suffix.
 
-    A .csv is a Live Link Face take where every name is a different ARKit shape, and a table otherwise or where the name
-    ends in .table.csv.
+    - .csv: a Live Link Face take where every name is a different ARKit shape; a table otherwise, or where the name ends
+      in .table.csv.
+    - .json: a table; Audio2Face weights where the name ends in .a2f.json.
+    - .npz: a table.
+    - .py: a script that keys the shapes in Blender; in Maya where the name ends in .maya.py.
+    - .glb, .vrm: the avatar itself with the clip as its first animation, if that is a glTF file; else the rig.
+    - USD: the rig with its animation.
+
+    Args:
+        clip: What to write.
+        path: Where.
+        rig: The rig that it moves, for formats that hold one.
+        avatar: Name or file that the rig came from.
 
     Raises:
-        ReenactError: Another suffix, .glb without a rig, or the file cannot be written.
+        ReenactError: Another suffix, no rig for a format that holds one, or the file cannot be written.
     """
-    path = Path(path)
+    path, name = Path(path), Path(path).name.lower()
     suffix = path.suffix.lower()
     if suffix == ".csv":
-        shapes = [arkit.canonical(name) for name in clip.names]
-        takes = None not in shapes and len(set(shapes)) == len(shapes)
-        if takes and not path.name.lower().endswith(".table.csv"):
-            livelink.save(clip, path)
-        else:
-            table.save_csv(clip, path)
+        shapes = [arkit.canonical(each) for each in clip.names]
+        take = None not in shapes and len(set(shapes)) == len(shapes) and not name.endswith(".table.csv")
+        _module("livelink").save(clip, path) if take else _module("table").save_csv(clip, path)
+    elif suffix == ".json":
+        _module("audio2face" if name.endswith(".a2f.json") else "json_table").save(clip, path)
     elif suffix == ".npz":
-        table.save_npz(clip, path)
-    elif suffix == ".glb":
-        if rig is None:
-            raise ReenactError(f"{path}: a clip in .glb needs the rig that it moves; write .csv or .npz without one")
-        gltf.save(rig, path, conform(clip, rig))
+        _module("table").save_npz(clip, path)
+    elif suffix == ".py":
+        dcc = _module("dcc")
+        (dcc.save_maya if name.endswith(".maya.py") else dcc.save_blender)(clip, path)
+    elif suffix in (".glb", ".vrm", *_USD):
+        if avatar is not None and suffix not in _USD and Path(avatar).suffix.lower() in _GLTF:
+            lost = _module("gltf_write").animate(Path(avatar), clip, path)
+            if lost:
+                warnings.warn(f"{avatar}: shapes of the clip that it lacks: {', '.join(lost)[:300]}", stacklevel=2)
+        elif suffix == ".vrm":
+            raise ReenactError(f"{path}: a .vrm is written from a .vrm or .glb avatar, got {avatar or 'none'}")
+        elif rig is None:
+            raise ReenactError(
+                f"{path}: a clip in {suffix} needs the rig that it moves; write .csv or .npz without one"
+            )
+        else:
+            save_rig(rig, path, clip)
     else:
-        raise ReenactError(f"{path}: a clip is written as .csv, .npz or .glb, got {path.suffix or 'no suffix'}")
+        raise ReenactError(f"{path}: a clip is written as {', '.join(SAVED_CLIPS)}, got {suffix or 'no suffix'}")
 
 
-def conform(clip: Clip, rig: Rig, where: str = "clip") -> Clip:
-    """The clip with the rig's shapes, in the rig's order.
-
-    A shape takes the column with its name. Without one it takes the mean of the columns that stand for the same ARKit
-    shapes (`arkit.meaning`): `eyeBlink_L` takes `EyeBlinkLeft`; both halves of a split `browInnerUp` take the whole,
-    and the whole the mean of the halves; a merged `eyeBlink` takes the mean of both sides. Shapes that nothing matches
-    stay at 0. Warns of columns that move but match no shape, and of shapes that stay at 0.
-
-    Raises:
-        ReenactError: Nothing matches.
-    """
-    if clip.names == rig.names:
-        return clip
-    column_of = {name: index for index, name in enumerate(clip.names)}
-    standing: dict[str, list[int]] = {}
-    for index, name in enumerate(clip.names):
-        for part in arkit.meaning(name):
-            standing.setdefault(part, []).append(index)
-    mixing = torch.zeros(len(clip.names), len(rig.names), dtype=clip.weights.dtype, device=clip.weights.device)
-    for index, name in enumerate(rig.names):
-        if name in column_of:
-            mixing[column_of[name], index] = 1
-            continue
-        parts = [standing[part] for part in arkit.meaning(name) if part in standing]
-        for columns in parts:
-            for column in columns:
-                mixing[column, index] += 1 / (len(parts) * len(columns))
-    if not mixing.any():
-        raise ReenactError(
-            f"{where}: none of its {len(clip.names)} shapes ({', '.join(clip.names[:3])}, ...) is one of {rig.name} "
-            f"({', '.join(rig.names[:3])}, ...); rename its columns"
-        )
-    unused = (mixing == 0).all(1) & (clip.weights.abs().amax(0) > 0 if len(clip) else False)
-    lost = [clip.names[index] for index in unused.nonzero().flatten().tolist()]
-    still = [rig.names[index] for index in (mixing == 0).all(0).nonzero().flatten().tolist()]
-    if lost:
-        warnings.warn(f"{where}: shapes that {rig.name} lacks are left out: {', '.join(lost)}", stacklevel=2)
-    if still:
-        warnings.warn(f"{where}: shapes of {rig.name} that it lacks stay at 0: {', '.join(still)}", stacklevel=2)
-    return Clip(rig.names, clip.weights @ mixing, clip.fps)
+def _module(name: str) -> ModuleType:
+    return import_module(f"reenact.rigs.formats.{name}")
 
 
 def _synthetic(text: str, rig: Rig) -> Clip:
@@ -175,10 +201,19 @@ def _read_clip(path: Path) -> Clip:
             raise ReenactError(
                 f"{path}: expected a clip, found a rig (it has a neutral); give it where a rig is asked for"
             )
-        return table.load_npz(path)
-    if suffix != ".csv":
-        return gltf.load_clip(path)
-    return livelink.load(path) if livelink.is_livelink(table.header(path)) else table.load_csv(path)
+        return _module("table").load_npz(path)
+    if suffix == ".csv":
+        table = _module("table")
+        livelink = _module("livelink")
+        audio2face = _module("audio2face")
+        header = table.header(path)
+        if livelink.is_livelink(header):
+            return livelink.load(path)
+        return audio2face.load_csv(path) if audio2face.is_audio2face_csv(header) else table.load_csv(path)
+    if suffix == ".json":
+        json_table, audio2face = _module("json_table"), _module("audio2face")
+        return (audio2face if audio2face.is_audio2face(json_table.read(path)) else json_table).load(path)
+    return _module(_MODULES[suffix]).load_clip(path)
 
 
 def _existing(text: str, suffixes: tuple[str, ...], noun: str) -> Path:

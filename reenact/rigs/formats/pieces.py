@@ -23,7 +23,7 @@ from reenact.rigs.formats import disk
 from reenact.rigs.rig import PARTS, Rig
 
 ATLAS = 2048
-"""Pixels along each side of the one texture that several pictures become."""
+"""Largest side, in pixels, of the one texture that several pictures become."""
 
 GUTTER = 8
 """Pixels of its own edge around each picture of an atlas, so that mip maps do not mix neighbours at once."""
@@ -57,6 +57,10 @@ class Choice:
     def __post_init__(self) -> None:
         if not all(self.parts) or not all(self.shapes):
             raise ReenactError("expected names or patterns of parts and shapes, got an empty one; leave it out")
+
+
+DEFAULT = Choice()
+"""What is taken where nobody chooses."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +130,7 @@ class Assembly:
 def assemble(
     where: Path,
     pieces: Sequence[Piece],
-    choice: Choice = Choice(),  # noqa: B008 - frozen
+    choice: Choice = DEFAULT,
     pictures: Mapping[Hashable, Callable[[], np.ndarray]] | None = None,
     name: str | None = None,
 ) -> Assembly:
@@ -211,6 +215,50 @@ def assemble(
     return Assembly(rig, facts, converted)
 
 
+def reduced(rig: Rig, choice: Choice, format: str) -> tuple[Rig, Contents]:
+    """A whole rig with only the chosen parts and shapes, and what it held.
+
+    Faces that touch a chosen part stay, with all of their vertices.
+
+    Args:
+        rig: Any.
+        choice: Its `parts` are names of `PARTS` here.
+        format: For `Contents`.
+
+    Raises:
+        ReenactError: A pattern matches nothing, or no shapes or faces are left.
+    """
+    names = _shape_names(Path(rig.name), [_shapes_of(rig)], choice)
+    if names != rig.names:
+        rig = replace(rig, names=names, deltas=rig.deltas[[rig.names.index(name) for name in names]])
+    present = [] if rig.parts is None else [PARTS[index] for index in rig.parts.unique().tolist()]
+    for pattern in choice.parts:
+        if not any(matches(part, [pattern]) for part in present):
+            raise ReenactError(f"{rig.name}: no part is called {pattern}; it has {', '.join(present) or 'no parts'}")
+    used = [part for part in present if not choice.parts or matches(part, choice.parts)]
+    if used != present:
+        kept = torch.isin(rig.parts, torch.tensor([PARTS.index(part) for part in used]))[rig.faces].any(1)
+        vertices, faces = rig.faces[kept].unique(return_inverse=True)
+        fields = {"neutral": rig.neutral[vertices], "deltas": rig.deltas[:, vertices], "parts": rig.parts[vertices]}
+        if rig.colors is not None:
+            fields["colors"] = rig.colors[vertices]
+        if rig.uv is not None:
+            fields["uv_faces"] = (rig.faces if rig.uv_faces is None else rig.uv_faces)[kept]
+        rig = replace(rig, faces=faces, **fields)
+    counts = {} if rig.parts is None else {part: int((rig.parts == PARTS.index(part)).sum()) for part in present}
+    facts = tuple(
+        MeshFacts(part, counts[part], 0, len(names), part in used, "part of the rig" if part in used else "not chosen")
+        for part in present
+    )
+    whole = MeshFacts(rig.name, len(rig.neutral), len(rig.faces), len(names), True, "has shapes")
+    return rig, Contents(format, (whole, *facts) if len(facts) > 1 else (whole,))
+
+
+def _shapes_of(rig: Rig) -> Piece:
+    nothing = np.zeros((0, 3), np.float32)
+    return Piece(rig.name, nothing, {}, rig.names, np.zeros((0, 3), np.int64), nothing)
+
+
 def matches(name: str, patterns: Sequence[str]) -> bool:
     """Whether the name fits one of the patterns, in either case."""
     return any(fnmatch.fnmatchcase(name.lower(), pattern.lower()) for pattern in patterns)
@@ -286,12 +334,9 @@ def _inside(piece: Piece, box: tuple[np.ndarray, np.ndarray]) -> bool:
     if len(piece.positions) == 0:
         return False
     low, high = piece.positions.min(0), piece.positions.max(0)
-    middle, margin = (low + high) / 2, 0.1 * (box[1] - box[0]).max()
-    return bool(
-        (middle > box[0] - margin).all()
-        and (middle < box[1] + margin).all()
-        and (high - low < box[1] - box[0] + margin).all()
-    )
+    middle, size = (low + high) / 2, float((box[1] - box[0]).max())
+    within = (middle > box[0] - 0.1 * size).all() and (middle < box[1] + 0.1 * size).all()
+    return bool(within and (high - low).max() < size)
 
 
 def _facts(pieces: Sequence[Piece], used: list[bool], reasons: list[str]) -> tuple[MeshFacts, ...]:
@@ -364,7 +409,7 @@ def _appearance(
         uv.append(moved.astype(np.float32))
         uv_faces.append(corner + start)
         start += len(moved)
-    converted.append(f"{len(keys)} pictures put side by side in one texture of {ATLAS} x {ATLAS}")
+    converted.append(f"{len(keys)} pictures put side by side in one texture of {len(texture)} x {len(texture)}")
     return texture, np.concatenate(uv), np.concatenate(uv_faces), tints
 
 
@@ -377,8 +422,10 @@ def _wrapped(uv: np.ndarray) -> np.ndarray:
 def _atlas(pictures: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
     """Pictures side by side, with one white cell more, and (u, v, width, height) of each within it."""
     side = int(np.ceil(np.sqrt(len(pictures) + 1)))
-    cell, inner = ATLAS // side, ATLAS // side - 2 * GUTTER
-    atlas = np.full((ATLAS, ATLAS, 3), 255, np.uint8)
+    largest = max(max(picture.shape[:2]) for picture in pictures)
+    size = min(ATLAS, 1 << int(np.ceil(np.log2(side * (largest + 2 * GUTTER)))))
+    cell, inner = size // side, size // side - 2 * GUTTER
+    atlas = np.full((size, size, 3), 255, np.uint8)
     places = []
     for index, picture in enumerate([*pictures, np.full((1, 1, 3), 255, np.uint8)]):
         row, column = divmod(index, side)
@@ -388,7 +435,7 @@ def _atlas(pictures: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
             :cell, :cell
         ]
         # Between the middles of the outermost pixels: looking up never leaves the cell.
-        places.append(np.array([left + GUTTER + 0.5, top + GUTTER + 0.5, inner - 1, inner - 1]) / ATLAS)
+        places.append(np.array([left + GUTTER + 0.5, top + GUTTER + 0.5, inner - 1, inner - 1]) / size)
     return atlas, places
 
 
