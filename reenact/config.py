@@ -168,6 +168,30 @@ class TrainingConfig:
 
 
 @dataclass(frozen=True)
+class PostConfig:
+    """What is done to a clip after retargeting; nothing, unless asked for. Names may be patterns with `*` and `?`."""
+
+    gain: dict[str, float] = field(default_factory=dict)
+    """Factor of each shape."""
+    offset: dict[str, float] = field(default_factory=dict)
+    """Added to each shape."""
+    low: dict[str, float] = field(default_factory=dict)
+    """Least weight of each shape."""
+    high: dict[str, float] = field(default_factory=dict)
+    """Greatest weight of each shape."""
+    lock: dict[str, float] = field(default_factory=dict)
+    """Weight that a shape has in every frame."""
+    rest: float | None = None
+    """Second of the clip at which the face begins to rest: its weights there become 0. None leaves them."""
+    rest_seconds: float = 0.5
+    """How long it rests."""
+    smooth: float = 0.0
+    """Seconds over which noise is averaged; blinks and other large changes stay sharp. 0 leaves it."""
+    smooth_range: float = 0.08
+    """Change of a weight that counts as motion and not as noise."""
+
+
+@dataclass(frozen=True)
 class Config:
     """Train networks that move expressions between two rigs."""
 
@@ -175,6 +199,14 @@ class Config:
     """Rig that the motion comes from: a built-in name (see `reenact rigs`) or a file."""
     target: str = "anny:toon"
     """Rig that the motion goes to."""
+    source_parts: tuple[str, ...] = ()
+    """Meshes of the source's file that make the rig, as names or patterns; none takes what belongs to the face."""
+    source_shapes: tuple[str, ...] = ()
+    """Blendshapes of the source to use, as names or patterns; none takes all."""
+    target_parts: tuple[str, ...] = ()
+    """As `source_parts`, of the target."""
+    target_shapes: tuple[str, ...] = ()
+    """As `source_shapes`, of the target."""
     source_clip: str | None = None
     """Training motion of the source: a file or `synthetic:SEED[:SECONDS]`; None samples random valid expressions."""
     target_clip: str | None = None
@@ -187,6 +219,7 @@ class Config:
     reenactnet: ReenactNetConfig = field(default_factory=ReenactNetConfig)
     bpnet: BPNetConfig = field(default_factory=BPNetConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
+    post: PostConfig = field(default_factory=PostConfig)
 
 
 def load_config(path: Path | str) -> Config:
@@ -249,6 +282,12 @@ def check_config(config: Config, origin: str = "settings") -> None:
             raise ReenactError(f"{origin}: {key}: expected a finite number, got {value}")
         if isinstance(value, str) and not (value and _is_unicode(value)):
             raise ReenactError(f"{origin}: {key}: expected a name or path in Unicode, got {value!r}")
+        if isinstance(value, tuple) and not all(each and _is_unicode(each) for each in value):
+            raise ReenactError(f"{origin}: {key}: expected names or patterns, got an empty one in {list(value)}")
+        if isinstance(value, dict):
+            for name, number in value.items():
+                if not (name and _is_unicode(name) and math.isfinite(number)):
+                    raise ReenactError(f"{origin}: {key}: expected names with finite numbers, got {name!r} = {number}")
         allowed = _ALLOWED.get(key)
         if allowed is not None and value is not None and not allowed[1](value):
             raise ReenactError(f"{origin}: {key}: expected {allowed[0]}, got {value}")
@@ -319,6 +358,10 @@ _ALLOWED: dict[str, _Rule] = {
     "training.save_every": _ONE_OR_MORE,
     "training.keep": _ONE_OR_MORE,
     "training.threads": _ONE_OR_MORE,
+    "post.rest": _NOT_NEGATIVE,
+    "post.rest_seconds": _POSITIVE,
+    "post.smooth": ("a number of seconds from 0 to 2", lambda value: 0 <= value <= 2),
+    "post.smooth_range": _POSITIVE,
 }
 """What the numbers allow, in words and as a test; None always passes where the type has it."""
 
@@ -342,6 +385,12 @@ def _convert(kind: Any, value: Any, origin: str, key: str) -> Any:
         if get_origin(option) is Literal:
             if value in get_args(option):
                 return value
+        elif get_origin(option) is tuple:
+            if isinstance(value, (list, tuple)) and all(type(each) is str for each in value):
+                return tuple(value)
+        elif get_origin(option) is dict:
+            if isinstance(value, dict) and all(type(each) in (int, float) for each in value.values()):
+                return {name: float(each) for name, each in value.items()}
         elif type(value) is option:  # not isinstance: True is an int to Python
             return value
         elif option is float and type(value) is int and abs(value) <= 2**53:  # beyond, floats skip numbers
@@ -363,6 +412,8 @@ _TYPE_WORDS = {
 def _expected(option: Any) -> list[str]:
     if get_origin(option) is Literal:
         return [json.dumps(choice) for choice in get_args(option)]
+    if get_origin(option) in (tuple, dict):
+        return ["a list of texts" if get_origin(option) is tuple else "a table of numbers by name"]
     return [] if option is types.NoneType else [_TYPE_WORDS[option]]  # TOML has no null: a key is left out
 
 
@@ -409,6 +460,13 @@ def _toml_line(key: str, value: Any) -> str:
         return f"# {key} is not set"
     if isinstance(value, bool):
         return f"{key} = {str(value).lower()}"
-    if isinstance(value, str):  # TOML's strings are JSON's, but for one character that must be escaped
-        return f"{key} = {json.dumps(value, ensure_ascii=False)}".replace("\x7f", "\\u007f")
-    return f"{key} = {value!r}"
+    if isinstance(value, tuple):
+        return f"{key} = [{', '.join(_toml_text(each) for each in value)}]"
+    if isinstance(value, dict):
+        return f"{key} = {{{', '.join(f'{_toml_text(name)} = {each!r}' for name, each in value.items())}}}"
+    return f"{key} = {_toml_text(value) if isinstance(value, str) else repr(value)}"
+
+
+def _toml_text(text: str) -> str:
+    """TOML's strings are JSON's, but for one character that must be escaped."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

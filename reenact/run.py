@@ -28,6 +28,7 @@ from reenact.errors import ReenactError
 from reenact.layout import find_layout
 from reenact.models import Networks
 from reenact.rigs.files import load_clip, load_rig, save_clip, save_rig
+from reenact.rigs.formats.pieces import Choice
 from reenact.rigs.rig import Rig
 
 _LAYOUT_RESOLUTION = 64
@@ -53,7 +54,10 @@ class Run:
             ReenactError: The folder already holds something, or a rig or clip cannot be read or photographed.
             OSError: The folder cannot be made.
         """
-        rigs = [load_rig(name) for name in (config.source, config.target)]
+        rigs = [
+            load_rig(config.source, Choice(config.source_parts, config.source_shapes)),
+            load_rig(config.target, Choice(config.target_parts, config.target_shapes)),
+        ]
         folder = Path(config.run) if config.run else _new_folder(rigs)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise ReenactError(

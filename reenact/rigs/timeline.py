@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from reenact.errors import ReenactError
+from reenact.rigs.clip import Clip
 
 
 def steady(
@@ -59,3 +61,21 @@ def steady(
         return weights, fps
     grid = times[0] + np.arange(round(span * fps) + 1) / fps
     return np.stack([np.interp(grid, times, column) for column in weights.T], axis=1), fps
+
+
+def resampled(clip: Clip, fps: float) -> Clip:
+    """The same motion at another rate: weights are linear between frames, the first frame stays the first.
+
+    Raises:
+        ReenactError: The rate is not a number from 1 to 1000.
+    """
+    if not 1 <= fps <= 1000:
+        raise ReenactError(f"expected 1 to 1000 frames per second, got {fps:g}")
+    if fps == clip.fps or len(clip) == 0:
+        return Clip(clip.names, clip.weights, fps)
+    last = (len(clip) - 1) / clip.fps
+    places = torch.arange(int(last * fps + 1e-6) + 1, dtype=torch.float64) * (clip.fps / fps)
+    before = places.floor().long().clamp(max=len(clip) - 1)
+    share = (places - before).to(clip.weights)[:, None]
+    after = (before + 1).clamp(max=len(clip) - 1)
+    return Clip(clip.names, clip.weights[before] * (1 - share) + clip.weights[after] * share, fps)
