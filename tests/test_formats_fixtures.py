@@ -1,6 +1,5 @@
 """Files that Blender and glTF Transform wrote mean what they mean there: see tests/fixtures/README.md."""
 
-import importlib
 import warnings
 from pathlib import Path
 
@@ -37,7 +36,6 @@ FILES = {  # file: package that it needs, error of positions, error of offsets
     "obj": (None, FLOAT, 2e-6),  # six decimals, twice
 }
 MOVING = [file for file in FILES if file != "obj"]
-MODULES = {".fbx": "fbx", ".usdc": "usd", "": "obj"}
 
 
 def rig_of(file: str) -> Rig:
@@ -47,8 +45,6 @@ def rig_of(file: str) -> Rig:
         pytest.importorskip(package)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        if path.suffix in MODULES:
-            return importlib.import_module(f"reenact.rigs.formats.{MODULES[path.suffix]}").load(path)
         return load_rig(str(path))
 
 
@@ -58,8 +54,6 @@ def clip_of(file: str) -> Clip:
         pytest.importorskip(package)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        if path.suffix in MODULES:
-            return importlib.import_module(f"reenact.rigs.formats.{MODULES[path.suffix]}").load_clip(path)
         return read_clip(path)
 
 
