@@ -8,11 +8,12 @@ and mouth line on the same rows of the picture, the only alignment that the publ
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reenact.errors import ReenactError
@@ -43,6 +44,14 @@ MAKEUP = {
 """sRGB of the parts that `made_up` paints."""
 
 _LID_SHAPES = ("eyeBlinkLeft", "eyeBlinkRight")
+_LID_WORDS = re.compile(
+    r"blink|wink|eyes?[ _.-]?clos|clos\w*[ _.-]?eyes?|eye[ _.-]?lid|squint|まばたき|ウィンク|^笑い$|瞬"
+)
+_MOUTH_WORDS = re.compile(
+    r"mouth|lips?([^a-z]|$)|mth|viseme|vrc\.v|pucker|smile|pout|phoneme|口|^[あいうえおんワω∧▲]$"
+    r"|^(aa|ih|ou|ee|oh|a|i|u|e|o)$|^v[ _.](aa|ih|ou|ee|oh)$"
+)
+"""Words of rigs that do not speak ARKit: VRM, VRoid, VRChat, MMD, game engines."""
 _MOUTH_SHAPES = ("mouthPucker", "mouthFunnel", "mouthClose", "mouthSmileLeft", "mouthSmileRight")
 
 
@@ -183,32 +192,62 @@ def made_up(rig: Rig) -> Rig:
 def face_lines(rig: Rig) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     """Middle of the eyes and middle of the mouth of the neutral, in the rig's frame.
 
-    From the part labels where the rig has them; else from what blink and mouth shapes move, where names tell them; else
-    from what any shapes move: motion lies in two heights, around the eyes and around the mouth.
+    Each from the part labels where the rig has them; else from what shapes with names of lids and lips move, ARKit's or
+    words such as "wink" or "viseme"; else from what any shapes move: motion lies in two heights, around the eyes and
+    around the mouth. Shapes that move the whole body say nothing about the face.
 
     Raises:
-        ReenactError: Fewer than two shapes move anything.
+        ReenactError: Eyes or mouth have no part and no name, and fewer than two shapes move anything.
     """
-    if len(rig.part("eyes")) and len(rig.part("lips")):
-        return _box_middle(rig, rig.part("eyes")), _box_middle(rig, rig.part("lips"))
     motion = rig.deltas.norm(dim=-1)  # (K, V)
-    moving = motion.sum(1) > 1e-12
-    known = [arkit.canonical(name) if moves else None for name, moves in zip(rig.names, moving)]
-    lids = [k for k, name in enumerate(known) if name in _LID_SHAPES]
-    mouth = [k for k, name in enumerate(known) if name in _MOUTH_SHAPES]
-    if lids and mouth:
-        return _motion_middle(rig, motion[lids].sum(0)), _motion_middle(rig, motion[mouth].sum(0))
+    local = _local(rig, motion)
+    known = [arkit.canonical(name) if moves else None for name, moves in zip(rig.names, local)]
+    eyes = _part_middle(rig, "eyes")
+    if eyes is None:
+        eyes = _named_middle(rig, motion, known, local, _LID_SHAPES, _LID_WORDS)
+    mouth = _part_middle(rig, "lips")
+    if mouth is None:
+        mouth = _named_middle(rig, motion, known, local, _MOUTH_SHAPES, _MOUTH_WORDS)
+    if eyes is not None and mouth is not None:
+        return eyes, mouth
     heights = (motion * rig.neutral[:, 1]).sum(1) / motion.sum(1).clamp_min(1e-12)  # (K,)
-    if int(moving.sum()) < 2:
+    if int(local.sum()) < 2:
         raise ReenactError(
-            f"{rig.name}: expected blendshapes that move eyes and mouth, got {int(moving.sum())} that move anything; "
+            f"{rig.name}: expected blendshapes that move eyes and mouth, got {int(local.sum())} that move anything; "
             "check that the export kept the deltas"
         )
-    ordered = heights[moving].sort().values
+    ordered = heights[local].sort().values
     border = ordered[:-1] + ordered.diff() / 2
     split = border[ordered.diff().argmax()]
-    upper, lower = moving & (heights > split), moving & (heights <= split)
-    return _motion_middle(rig, motion[upper].sum(0)), _motion_middle(rig, motion[lower].sum(0))
+    upper, lower = local & (heights > split), local & (heights <= split)
+    eyes = _motion_middle(rig, motion[upper].sum(0)) if eyes is None else eyes
+    return eyes, _motion_middle(rig, motion[lower].sum(0)) if mouth is None else mouth
+
+
+def _local(rig: Rig, motion: Float[Tensor, "K V"]) -> Bool[Tensor, "K"]:
+    """Which shapes move something, and not three times as far around as most others do: not the whole body."""
+    total = motion.sum(1)
+    moving = total > 1e-6 * total.max().clamp_min(1e-12)
+    share = motion / total.clamp_min(1e-12)[:, None]
+    middle = share @ rig.neutral  # (K, 3)
+    spread = (share @ rig.neutral.square() - middle.square()).sum(1).clamp_min(0).sqrt()
+    usual = spread[moving].median() if bool(moving.any()) else spread.new_zeros(())
+    return moving & (spread <= 3 * usual)
+
+
+def _part_middle(rig: Rig, part: str) -> Tensor | None:
+    vertices = rig.part(part)
+    return _box_middle(rig, vertices) if len(vertices) else None
+
+
+def _named_middle(
+    rig: Rig, motion: Tensor, known: list[str | None], local: Tensor, shapes: tuple[str, ...], words: re.Pattern
+) -> Tensor | None:
+    """Middle of what the shapes move that are ARKit's, or else whose names hold such words; None without any."""
+    chosen = [index for index, name in enumerate(known) if name in shapes]
+    if not chosen:
+        chosen = [index for index, name in enumerate(rig.names) if local[index] and words.search(name.lower())]
+    return _motion_middle(rig, motion[chosen].sum(0)) if chosen else None
 
 
 def _box_middle(rig: Rig, vertices: Tensor) -> Tensor:

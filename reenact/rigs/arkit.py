@@ -109,6 +109,13 @@ def _spellings() -> dict[str, tuple[str, ...]]:
         base = left.removesuffix("Left").lower()
         for both in ("", "both", "lr"):
             spellings[base + both] = (left, right)
+    # Blinks of VRM (blinkLeft, blink_l), VRoid (Fcl_EYE_Close_L) and game engines (eyesClosed).
+    for base in ("blink", "eyeclose", "eyeclosed", "fcleyeclose"):
+        for side, name in (("l", "eyeBlinkLeft"), ("r", "eyeBlinkRight")):
+            spellings[base + side] = (name,)
+            spellings[base + {"l": "left", "r": "right"}[side]] = (name,)
+        spellings[base] = ("eyeBlinkLeft", "eyeBlinkRight")
+    spellings["eyesclosed"] = spellings["eyesclose"] = ("eyeBlinkLeft", "eyeBlinkRight")
     spellings["eyelookleft"] = ("eyeLookOutLeft", "eyeLookInRight")
     spellings["eyelookright"] = ("eyeLookOutRight", "eyeLookInLeft")
     for name in SPLIT:
