@@ -92,8 +92,9 @@ def _numbers(column: np.ndarray) -> str:
 def _aliases(names: tuple[str, ...]) -> dict[str, str]:
     """Literals of how much a shape takes of the clip's, by every spelling of an ARKit shape that takes any."""
     spellings = tuple(arkit._SPELLINGS)
+    unlike = [f"|{spelling}" for spelling in spellings]  # a name of the clip's own is not meant by it alone
     aliases = {}
-    for spelling, shares in zip(spellings, matching(names, spellings).T.numpy()):
+    for spelling, shares in zip(spellings, matching(names, unlike).T.numpy()):
         taken = np.flatnonzero(shares)
         if len(taken):
             aliases[spelling] = f"{{{', '.join(f'{names[index]!a}: {shares[index]}' for index in taken)}}}"
