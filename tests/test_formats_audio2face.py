@@ -9,6 +9,7 @@ import torch
 
 from reenact.errors import ReenactError
 from reenact.rigs.clip import Clip
+from reenact.rigs.files import read_clip
 from reenact.rigs.formats import audio2face, json_table
 
 GOOD = {  # as version 2023 writes them
@@ -136,3 +137,12 @@ def test_frames_of_the_service_that_are_none_are_refused(text, message, tmp_path
     (tmp_path / "bad.csv").write_text(text)
     with pytest.raises(ReenactError, match=message):
         audio2face.load_csv(tmp_path / "bad.csv")
+
+
+def test_either_file_is_known_by_what_is_in_it(tmp_path):
+    (tmp_path / "t.json").write_text(json.dumps(GOOD))
+    (tmp_path / "t.csv").write_text("timeCode,blendShapes.jawOpen,blendShapes.eyeBlinkLeft\n0,0,0.5\n0.1,0.125,1\n")
+    for name, fps in (("t.json", 60.0), ("t.csv", 10.0)):
+        clip = read_clip(tmp_path / name)
+        assert (clip.names, clip.fps) == (("jawOpen", "eyeBlinkLeft"), fps)
+        assert clip.weights[:2].tolist() == GOOD["weightMat"][:2]
