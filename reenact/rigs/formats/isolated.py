@@ -20,7 +20,7 @@ import numpy as np
 from reenact.errors import ReenactError
 from reenact.rigs.formats import disk
 
-SECONDS = 20.0
+SECONDS = 10.0
 """Time that any file may take, start of the process included."""
 
 SECONDS_PER_MEGABYTE = 1.0

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel
+from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
 from reenact.errors import ReenactError
 
@@ -30,8 +30,7 @@ def scene(path: Path) -> dict[str, Any]:
     try:
         return _scene(path)
     except (Tf.ErrorException, RuntimeError, UnicodeDecodeError, OverflowError) as error:
-        text = " ".join(str(error).split())
-        raise ReenactError(f"{path}: expected a USD file, it is damaged or something else ({text[:160]})") from None
+        raise ReenactError(f"{path}: expected a USD file, it is damaged or something else{_said(error)}") from None
 
 
 def _scene(path: Path) -> dict[str, Any]:
@@ -45,11 +44,11 @@ def _scene(path: Path) -> dict[str, Any]:
     reader = _Reader(path, stage, notes)
     reader.read_meshes()
     return {
-        "meters": float(UsdGeom.GetStageMetersPerUnit(stage)),
+        "meters": UsdGeom.GetStageMetersPerUnit(stage),
         "meters_said": bool(UsdGeom.StageHasAuthoredMetersPerUnit(stage)),
         "up": str(UsdGeom.GetStageUpAxis(stage)),
         "creator": str(layer.documentation or layer.customLayerData.get("creator", ""))[:80],
-        "rate": float(stage.GetTimeCodesPerSecond()),
+        "rate": stage.GetTimeCodesPerSecond(),
         "meshes": reader.meshes,
         "pictures": reader.pictures,
         "animations": reader.animations,
@@ -165,10 +164,9 @@ class _Reader:
             "animation": self._animation_of(prim, binding),
             "own": {key: str(own[key]) for key in ("name", "partNames") if key in own} if isinstance(own, dict) else {},
         }
-        holes = mesh.GetHoleIndicesAttr().Get(_FIRST)
-        if holes:
+        rows = _array(where, mesh.GetHoleIndicesAttr(), np.int64)
+        if len(rows):
             kept = np.ones(len(counts), bool)
-            rows = np.array(holes, np.int64)
             kept[rows[(rows >= 0) & (rows < len(counts))]] = False
             entry["holes"] = kept
         self._faces_look(where, prim, entry)
@@ -188,7 +186,7 @@ class _Reader:
     def _shapes(self, where: str, prim: Usd.Prim) -> tuple[dict[str, str], dict[str, Any]]:
         """Names of the shapes by the token that animation has for them; rows and offsets of each name."""
         binding = UsdSkel.BindingAPI(prim)
-        tokens = [str(token) for token in binding.GetBlendShapesAttr().Get() or ()]
+        tokens = _tokens(where, binding.GetBlendShapesAttr())
         targets = binding.GetBlendShapeTargetsRel().GetTargets()
         if not tokens:
             return {}, {}
@@ -206,11 +204,9 @@ class _Reader:
                 name = token if token not in shapes else name + "_"
             names[token] = name
             offsets = _array(f"{where}.{target.name}", shape.GetOffsetsAttr(), np.float32, 3)
-            rows = shape.GetPointIndicesAttr()
-            listed = rows.HasAuthoredValue() and len(rows.Get() or ()) > 0
-            shapes[name] = [_array(where, rows, np.int64) if listed else None, offsets]
-            if rows.HasAuthoredValue() and not listed and len(offsets) == 0:
-                shapes[name] = [np.zeros(0, np.int64), np.zeros((0, 3), np.float32)]
+            rows = _array(f"{where}.{target.name}", shape.GetPointIndicesAttr(), np.int64)
+            # Without indices the offsets are those of all points; without either nothing moves.
+            shapes[name] = [None if len(rows) == 0 and len(offsets) else rows, offsets]
             if shape.GetInbetweens():
                 self.notes.append(f"{name}: shapes in between are left out, the full one counts")
         return names, shapes
@@ -225,7 +221,7 @@ class _Reader:
             UsdGeom.Imageable(prim), UsdGeom.Tokens.face, UsdShade.Tokens.materialBind
         )
         for subset in subsets:
-            rows = np.array(subset.GetIndicesAttr().Get(_FIRST) or (), np.int64)
+            rows = _array(where, subset.GetIndicesAttr(), np.int64)
             if len(rows) and (rows.min() < 0 or rows.max() >= len(surface)):
                 raise ReenactError(f"{where}: {subset.GetPrim().GetName()} names a face outside 0..{len(surface) - 1}")
             surface[rows] = len(surfaces)
@@ -242,7 +238,7 @@ class _Reader:
                 entry["colors"] = _per_vertex(where, entry, *self._primvar(where, color, 3))
         part = UsdGeom.PrimvarsAPI(prim).GetPrimvar("reenactPart")
         if part and part.GetTypeName() == Sdf.ValueTypeNames.IntArray and entry["own"].get("partNames"):
-            entry["part"] = np.array(part.Get(_FIRST) or (), np.int64)
+            entry["part"] = _array(where, part.GetAttr(), np.int64)
 
     def _uv(self, where: str, prim: Usd.Prim, entry: dict[str, Any], readers: set[str]) -> dict[str, Any]:
         api = UsdGeom.PrimvarsAPI(prim)
@@ -265,10 +261,10 @@ class _Reader:
         return {}
 
     def _primvar(self, where: str, primvar: UsdGeom.Primvar, width: int) -> tuple[np.ndarray, np.ndarray | None, str]:
-        values = np.array(primvar.Get(_FIRST) or (), np.float32).reshape(-1, width)
-        indices = primvar.GetIndices(_FIRST) if primvar.IsIndexed() else None
-        if indices is not None:
-            indices = np.array(indices, np.int64)
+        values = _array(where, primvar.GetAttr(), np.float32, width)
+        indices = None
+        if primvar.IsIndexed():
+            indices = _array(where, primvar.GetIndicesAttr(), np.int64)
             if len(indices) and (indices.min() < 0 or indices.max() >= len(values)):
                 raise ReenactError(f"{where}: {primvar.GetName()} indexes values outside 0..{len(values) - 1}")
         return values, indices, str(primvar.GetInterpolation())
@@ -340,13 +336,13 @@ class _Reader:
         key = str(prim.GetPath())
         if key not in self.sources:
             animation = UsdSkel.Animation(prim)
-            tokens = [str(token) for token in (animation.GetBlendShapesAttr().Get() if animation else ()) or ()]
+            tokens = _tokens(f"{self.path}: {key}", animation.GetBlendShapesAttr()) if animation else []
             attribute = animation.GetBlendShapeWeightsAttr() if tokens else None
             times = attribute.GetTimeSamples() if attribute else []
             if not times:
                 self.sources[key] = -1
                 return None
-            rows = [np.array(attribute.Get(time) or (), np.float32) for time in times]
+            rows = [_array(f"{self.path}: {key}", attribute, np.float32, None, time) for time in times]
             wrong = [time for time, row in zip(times, rows) if len(row) != len(tokens)]
             if wrong:
                 raise ReenactError(
@@ -368,10 +364,40 @@ def _shape_name(token: str, prim: str) -> str:
     return prim if re.fullmatch(re.escape(prim) + r"_?\d+", token) else token
 
 
-def _array(where: str, attribute: Usd.Attribute, dtype: type, width: int | None = None) -> np.ndarray:
-    value = attribute.Get(_FIRST)
-    array = np.array(() if value is None else value, dtype)
-    return array.reshape(-1) if width is None else array.reshape(-1, width)
+def _array(
+    where: str, attribute: Usd.Attribute, dtype: type, width: int | None = None, time: Any = _FIRST
+) -> np.ndarray:
+    """The value of an attribute as (N,) or (N, width); empty where it has none."""
+    value = attribute.Get(time)
+    try:
+        array = np.array(() if value is None else value)
+        if array.size and array.dtype.kind not in "fiu":
+            raise ValueError(array.dtype)
+        return array.astype(dtype).reshape(-1) if width is None else array.astype(dtype).reshape(-1, width)
+    except (ValueError, TypeError):
+        raise ReenactError(
+            f"{where}: expected {attribute.GetName()} as numbers{f' in rows of {width}' if width else ''}, got "
+            f"{type(value).__name__}; export it again"
+        ) from None
+
+
+def _tokens(where: str, attribute: Usd.Attribute) -> list[str]:
+    value = attribute.Get()
+    if value is None:
+        return []
+    if not isinstance(value, Vt.TokenArray):
+        raise ReenactError(f"{where}: expected {attribute.GetName()} as names, got {type(value).__name__}")
+    return [str(token) for token in value]
+
+
+def _said(error: Exception) -> str:
+    """What the library says of an error, in brackets; nothing where that is not text."""
+    try:
+        lines = str(error).split()
+    except UnicodeDecodeError:
+        return ""
+    text = " ".join(lines).rsplit(" : ", 1)[-1].strip("'")
+    return f" ({text[:160]})" if text else ""
 
 
 def _per_vertex(
