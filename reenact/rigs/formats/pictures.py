@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable, Mapping
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -73,3 +74,29 @@ def load(path: Path) -> UInt8[np.ndarray, "H W C"]:
         ReenactError: As `pixels` and `disk.read_bytes`.
     """
     return pixels(str(path), disk.read_bytes(path))
+
+
+def gather(
+    path: Path, named: Mapping[str, bytes | str]
+) -> tuple[dict[str, Callable[[], UInt8[np.ndarray, "H W C"]]], tuple[str, ...], list[str]]:
+    """Loaders of the pictures of a file, a line on each, and a line on each that is missing.
+
+    Args:
+        path: The file.
+        named: By key what it embeds, or the name of what should lie beside it.
+    """
+    found: dict[str, Callable[[], np.ndarray]] = {}
+    described, missing = [], []
+    for key, content in named.items():
+        name = key[-80:]
+        if isinstance(content, bytes):
+            found[key] = lambda content=content, name=name: pixels(f"{path}: {name}", content)
+            described.append(f"{name}: in the file")
+            continue
+        place = beside(path, content)
+        if place is None:
+            missing.append(f"picture {name} is not in the file's folder; left out")
+        else:
+            found[key] = lambda place=place: load(place)
+            described.append(f"{name}: {place.relative_to(path.parent.resolve())} beside the file")
+    return found, tuple(described), missing

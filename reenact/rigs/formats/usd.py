@@ -13,7 +13,7 @@ import io
 import re
 import tempfile
 import zipfile
-from collections.abc import Callable, Hashable
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,18 +65,12 @@ def read(path: Path, choice: Choice = DEFAULT) -> tuple[Rig, Contents]:
             its folder, or has no blend shapes.
     """
     scene = _scene(path)
-    meshes = _meshes(path, scene)
+    found, described, missing = pictures.gather(path, scene["pictures"])
+    meshes = _meshes(path, scene, found)
     pieces = [piece for mesh in meshes for piece in pieces_of(path, mesh)]
-    found, described = _pictures(path, scene)
-    for piece in pieces:
-        if piece.picture is not None and piece.picture not in found:
-            scene["notes"].append(f"picture {str(piece.picture)[:80]} is not in the file's folder; left out")
-    pieces = [
-        piece if piece.picture is None or piece.picture in found else _without_picture(piece) for piece in pieces
-    ]
     own = next((mesh["own"]["name"] for mesh in scene["meshes"] if mesh["own"].get("name")), None)
     made = assemble(path, pieces, choice, found, own if len(meshes) == 1 else None)
-    converted = list(dict.fromkeys([*_units(scene), *scene["notes"], *made.converted]))
+    converted = list(dict.fromkeys([*_units(scene), *scene["notes"], *missing, *made.converted]))
     creator = f", made by {scene['creator']}" if scene["creator"] else ""
     animations = tuple(
         f"{entry['name']}: {len(entry['times'])} frames of {len(entry['tokens'])} shapes, "
@@ -127,7 +121,7 @@ def _require(path: Path) -> None:
         raise ReenactError(f"{path}: needs the package usd-core; pip install reenact[usd]")
 
 
-def _meshes(path: Path, scene: dict[str, Any]) -> list[Mesh]:
+def _meshes(path: Path, scene: dict[str, Any], found: Collection[str]) -> list[Mesh]:
     meters = scene["meters"]
     if not 0 < meters < 1e9:
         raise ReenactError(f"{path}: expected a positive metersPerUnit, got {meters:g}")
@@ -159,7 +153,12 @@ def _meshes(path: Path, scene: dict[str, Any]) -> list[Mesh]:
                 uv_corners=uv_corners,
                 colors=entry.get("colors"),
                 surfaces=tuple(
-                    Surface(each["name"], tuple(each["color"]), each["picture"], each["opacity"])
+                    Surface(
+                        each["name"],
+                        tuple(each["color"]),
+                        each["picture"] if each["picture"] in found else None,
+                        each["opacity"],
+                    )
                     for each in entry["surfaces"]
                 ),
                 surface=surface,
@@ -181,29 +180,6 @@ def _parts(path: Path, entry: dict[str, Any]) -> np.ndarray | None:
             f"{len(entry['positions'])} vertices, got {len(part)}"
         )
     return known[part]
-
-
-def _pictures(path: Path, scene: dict[str, Any]) -> tuple[dict[Hashable, Callable[[], np.ndarray]], tuple[str, ...]]:
-    """Loaders of the pictures that are there, by their key, and a line on each."""
-    found: dict[Hashable, Callable[[], np.ndarray]] = {}
-    described = []
-    for key, content in scene["pictures"].items():
-        name = key[-80:]
-        if isinstance(content, bytes):
-            found[key] = lambda content=content, name=name: pictures.pixels(f"{path}: {name}", content)
-            described.append(f"{name}: in the file")
-            continue
-        place = pictures.beside(path, content)
-        if place is not None:
-            found[key] = lambda place=place: pictures.load(place)
-        described.append(f"{name}: {'beside the file' if place else 'not in the file’s folder'}")
-    return found, tuple(described)
-
-
-def _without_picture(piece: Any) -> Any:
-    from dataclasses import replace
-
-    return replace(piece, picture=None)
 
 
 def _units(scene: dict[str, Any]) -> list[str]:
