@@ -1,4 +1,4 @@
-"""The commands: reenact train | infer | evaluate | convert | rigs."""
+"""The commands: reenact train | infer | evaluate | convert | inspect | rigs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 from tyro.extras import subcommand_cli_from_dict
 
-from reenact.config import Config, changed_keys, check_config, load_config
+from reenact.config import Config, PostConfig, changed_keys, check_config, load_config
 from reenact.errors import ReenactError
 
 # PyTorch's threads wait for work by spinning, and would take the cores from the renderer's threads, which run between
@@ -26,8 +26,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 if TYPE_CHECKING:
     from rich.table import Table
 
-_CLIP_FILES = (".csv", ".npz", ".glb")
-_RIG_FILES = (".glb", ".npz")
+    from reenact.inspection import Inspection
+    from reenact.rigs.clip import Clip
+    from reenact.rigs.formats.pieces import Choice
+
+_USD_FILES = (".usd", ".usda", ".usdc", ".usdz")
+_RIG_FILES = (".glb", ".npz", ".obj", *_USD_FILES)
+_CLIP_FILES = (".csv", ".npz", ".json", ".glb", ".vrm", ".py", *_USD_FILES)
 
 
 def train(
@@ -38,8 +43,9 @@ def train(
 ) -> None:
     """Train networks that move expressions between two rigs.
 
-    A rig is a built-in name (`reenact rigs` lists them) or a .glb or .npz file. A clip is a .csv, .npz or .glb file, or
-    synthetic:SEED[:SECONDS]. Settings come from their defaults, then from --config, then from the options below.
+    A rig is a built-in name (`reenact rigs` lists them) or a file: .glb, .gltf, .vrm, .fbx, USD, .npz, or a folder of
+    .obj files; `reenact inspect` shows what is in it. A clip is a file, or synthetic:SEED[:SECONDS]. Settings come from
+    their defaults, then from --config, then from the options below.
 
     Args:
         settings: Every setting.
@@ -68,24 +74,32 @@ def infer(
     *,
     out: Annotated[Path, arg(metavar="FILE")],
     reverse: Annotated[bool, FlagCreatePairsOff] = False,
+    fps: float | None = None,
+    post: PostConfig = PostConfig(),  # noqa: B008 - frozen
 ) -> None:
     """Move a clip from a run's source rig to its target.
 
     Args:
         run: Folder that `reenact train` wrote.
-        clip: Motion of the source rig: a .csv (Live Link Face or a plain table), .npz or .glb file, or
-            synthetic:SEED[:SECONDS].
-        out: File to write; by its suffix a table (.csv), arrays (.npz), or the animated target rig (.glb).
+        clip: Motion of the source rig: a .csv (Live Link Face or a plain table), .json (Audio2Face or a table), .npz,
+            .glb, .vrm, .fbx or USD file, or synthetic:SEED[:SECONDS].
+        out: File to write, by its suffix: .csv (.table.csv for a plain table), .npz, .json (.a2f.json for Audio2Face),
+            .py (a script for Blender; .maya.py for Maya), .glb or .vrm (the avatar itself, animated), or USD.
         reverse: From the target to the source instead.
+        fps: Frames per second of the result; those of the clip unless said.
+        post: What to do to the result.
     """
     _check_out(out, _CLIP_FILES)
     _run_config(run)
+    check_config(Config(post=post), origin="command line")
     from reenact.inference import ImageRetargeter
+    from reenact.postprocessing import postprocess
     from reenact.rigs.files import load_clip, save_clip
 
     retargeter = ImageRetargeter.load(run, reverse=reverse)
-    moved = retargeter(load_clip(clip, retargeter.source))
-    save_clip(moved, out, retargeter.target)
+    moved = postprocess(_at_rate(retargeter(load_clip(clip, retargeter.source)), fps), post)
+    avatar = retargeter.config.source if reverse else retargeter.config.target
+    save_clip(moved, out, retargeter.target, avatar if Path(avatar).is_file() else None)
     print(f"{out}: {len(moved)} frames, {moved.duration:.1f} s, {retargeter.source.name} -> {retargeter.target.name}")
 
 
@@ -125,32 +139,92 @@ def convert(
     output: Annotated[Positional[Path], arg(metavar="OUT")],
     *,
     rig: Annotated[str | None, arg(metavar="RIG")] = None,
+    parts: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
+    shapes: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
+    fps: float | None = None,
+    post: PostConfig = PostConfig(),  # noqa: B008 - frozen
 ) -> None:
     """Turn a rig or a clip into another format.
 
-    Rigs: built-in names, .glb and .npz to .glb and .npz. Clips: .csv, .npz and .glb to .csv and .npz; with --rig also
-    synthetic:SEED[:SECONDS], and to .glb.
+    Rigs: built-in names, .glb, .gltf, .vrm, .fbx, USD, .npz, and folders of .obj files, to .glb, USD, .npz or a folder
+    of .obj files; an animation in the file comes along where both formats hold one. Clips: see `reenact infer`.
 
     Args:
         input: A file, a built-in rig, or with --rig a clip.
         output: File to write, in the format of its suffix.
-        rig: Read IN as a clip of this rig, a built-in name or a file: the clip gets its shapes, and in .glb its mesh.
+        rig: Read IN as a clip of this rig, a built-in name or a file: the clip gets its shapes, and in .glb, .vrm and
+            USD its mesh. A .glb or .vrm rig is kept as it is, and animated.
+        parts: Meshes of the rig to take, as names or patterns; what belongs to the face unless said.
+        shapes: Blendshapes of the rig to take, as names or patterns; all unless said.
+        fps: Frames per second of the clip.
+        post: What to do to the clip.
     """
-    from reenact.rigs.files import load_clip, load_rig, read_clip, save_clip, save_rig
+    check_config(Config(post=post), origin="command line")
+    from reenact.postprocessing import postprocess
+    from reenact.rigs.files import load_clip, load_rig, read_clip, save_clip
+    from reenact.rigs.formats.pieces import Choice
 
+    choice = Choice(parts, shapes)
     if rig is None and not _is_clip(input, output):
-        _check_out(output, _RIG_FILES)
-        loaded = load_rig(input)
-        save_rig(loaded, output)
-        print(f"{output}: {len(loaded.neutral)} vertices, {len(loaded.faces)} faces, {len(loaded.names)} blendshapes")
+        _convert_rig(input, output, choice, fps, post)
         return
     _check_out(output, _CLIP_FILES)
-    if rig is None and (input.startswith("synthetic:") or output.suffix.lower() == ".glb"):
+    if rig is None and (input.startswith("synthetic:") or output.suffix.lower() in (".glb", ".vrm", *_USD_FILES)):
         raise ReenactError(f"{input}: expected --rig beside this clip, got none; name the rig that it moves")
-    moved = None if rig is None else load_rig(rig)
+    moved = None if rig is None else load_rig(rig, choice)
     clip = read_clip(input) if moved is None else load_clip(input, moved)
-    save_clip(clip, output, moved)
+    clip = postprocess(_at_rate(clip, fps), post)
+    save_clip(clip, output, moved, rig)
     print(f"{output}: {len(clip)} frames, {clip.duration:.1f} s, {len(clip.names)} blendshapes")
+
+
+def inspect(
+    file: Annotated[Positional[str], arg(metavar="FILE")],
+    *,
+    out: Annotated[Path | None, arg(metavar="FILE.png")] = None,
+    json: Annotated[Path | None, arg(metavar="FILE.json")] = None,
+    parts: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
+    shapes: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
+    size: int = 160,
+) -> None:
+    """Show what is inside a rig file, what was made of it, and what looks wrong.
+
+    Prints meshes, shapes with their strength and region, animation, textures, and draws every shape at 1.
+
+    Args:
+        file: A rig: a built-in name or a file.
+        out: The contact sheet; NAME-shapes.png in this folder unless said.
+        json: Write the facts here too.
+        parts: Meshes to take, as names or patterns; what belongs to the face unless said.
+        shapes: Blendshapes to take, as names or patterns; all unless said.
+        size: Height and width of each picture of the sheet, in pixels.
+    """
+    for path, suffix in ((out, ".png"), (json, ".json")):
+        if path is not None:
+            _check_out(path, (suffix,))
+    if not 16 <= size <= 1024:
+        raise ReenactError(f"--size: expected 16 to 1024 pixels, got {size}")
+    from json import dumps
+
+    from reenact.atomic import write_atomically
+    from reenact.inspection import inspect, save_sheet
+    from reenact.rigs.files import read_rig
+    from reenact.rigs.formats.pieces import Choice
+
+    rig, contents = read_rig(file, Choice(parts, shapes))
+    facts = inspect(rig, contents)
+    console = Console(markup=False, emoji=False, highlight=False)
+    for line in _facts(facts):
+        console.print(line, soft_wrap=True)
+    if json is not None:
+        write_atomically(json, dumps(facts.to_dict(), indent=1, ensure_ascii=False).encode())
+    if facts.face is None:
+        console.print("\nNo contact sheet: eyes and mouth were not found, so nothing can be framed")
+        return
+    sheet = out or Path(f"{_plain(rig.name)}-shapes.png")
+    with console.status("Drawing") as status:
+        save_sheet(rig, facts, sheet, size, lambda done: status.update(f"Drawing {done} of {len(rig.names) + 1}"))
+    console.print(f"\nEvery shape at 1: {sheet}", soft_wrap=True)
 
 
 def rigs(
@@ -181,7 +255,14 @@ def rigs(
     console.print(f"\nContact sheet: {out}", highlight=False, soft_wrap=True)
 
 
-COMMANDS = {"train": train, "infer": infer, "evaluate": evaluate, "convert": convert, "rigs": rigs}
+COMMANDS = {
+    "train": train,
+    "infer": infer,
+    "evaluate": evaluate,
+    "convert": convert,
+    "inspect": inspect,
+    "rigs": rigs,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -194,7 +275,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: _say(console, "yellow", "warning", str(message))
         try:
-            commands = {**COMMANDS, "train": partial(train, settings=_train_defaults(arguments))}
+            commands = {
+                **COMMANDS,
+                "train": partial(train, settings=_train_defaults(arguments)),
+                "infer": partial(infer, post=_infer_defaults(arguments)),
+            }
             subcommand_cli_from_dict(
                 commands,
                 prog="reenact",
@@ -231,6 +316,14 @@ def _train_defaults(arguments: list[str]) -> Config:
     return Config()
 
 
+def _infer_defaults(arguments: list[str]) -> PostConfig:
+    """Where the post-processing of `infer` starts: as the run's settings say."""
+    if arguments[:1] != ["infer"]:
+        return PostConfig()
+    runs = [argument for argument in arguments[1:] if (Path(argument) / "config.toml").is_file()]
+    return load_config(Path(runs[0]) / "config.toml").post if runs else PostConfig()
+
+
 def _option(arguments: list[str], name: str) -> str | None:
     """The value of an option, before the settings that it chooses can be parsed with the rest."""
     for index, argument in enumerate(arguments):
@@ -251,13 +344,94 @@ def _run_config(run: Path | str) -> Path:
 
 
 def _is_clip(input: str, output: Path) -> bool:
-    """Whether a conversion is of a clip; a .glb may hold both, and is a rig unless its clip is asked for."""
+    """Whether a conversion is of a clip; a file that may hold both is a rig unless its clip is asked for."""
     from reenact.rigs.formats import npz
 
     path = Path(input)
     if path.suffix.lower() == ".npz" and path.is_file():
         return "weights" in npz.contents(path)
-    return ".csv" in (path.suffix.lower(), output.suffix.lower()) or input.startswith("synthetic:")
+    tables = (".csv", ".json", ".py")
+    return path.suffix.lower() in tables or output.suffix.lower() in tables or input.startswith("synthetic:")
+
+
+def _convert_rig(input: str, output: Path, choice: Choice, fps: float | None, post: PostConfig) -> None:
+    """A rig, with the animation that its file has where the other format holds one."""
+    from reenact.postprocessing import postprocess
+    from reenact.rigs.files import load_clip, read_rig, save_rig
+
+    folder = output.suffix == "" and output.parent.is_dir()
+    if not folder:
+        _check_out(output, _RIG_FILES)
+    rig, contents = read_rig(input, choice)
+    clip = None
+    if contents.animations and output.suffix.lower() in (".glb", *_USD_FILES):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a still shape or a choice of shapes is no news here
+            try:
+                clip = postprocess(_at_rate(load_clip(input, rig), fps), post)
+            except ReenactError:
+                clip = None  # an animation of bones only
+    save_rig(rig, output.with_suffix(".obj") if folder else output, clip)
+    motion = f", {len(clip)} frames at {clip.fps:g} fps" if clip is not None else ""
+    print(f"{output}: {len(rig.neutral)} vertices, {len(rig.faces)} faces, {len(rig.names)} blendshapes{motion}")
+
+
+def _at_rate(clip: Clip, fps: float | None) -> Clip:
+    """The clip at the rate that was asked for, and a word about it."""
+    if fps is None or fps == clip.fps:
+        return clip
+    from reenact.rigs.timeline import resampled
+
+    made = resampled(clip, fps)
+    print(f"{len(clip)} frames at {clip.fps:g} fps became {len(made)} at {fps:g}")
+    return made
+
+
+def _plain(name: str) -> str:
+    """A name that can begin a file name."""
+    return "".join(each if each.isalnum() or each in "-_." else "-" for each in name)[:80] or "rig"
+
+
+def _facts(facts: Inspection) -> list[Any]:
+    """What was found in a rig, for the terminal."""
+    from rich.table import Table
+
+    contents = facts.contents
+    width, height, depth = (100 * each for each in facts.size)
+    lines: list[Any] = [
+        f"{facts.name}: {contents.format}",
+        f"{facts.vertices} vertices, {facts.faces} faces, {len(facts.shapes)} blendshapes",
+        f"{width:.1f} cm wide, {height:.1f} cm tall, {depth:.1f} cm deep"
+        + (f"; {100 * facts.face:.1f} cm from eyes to mouth" if facts.face is not None else ""),
+    ]
+    lines += [f"parts: {', '.join(facts.parts)}"] if facts.parts else []
+    lines += [f"animation: {text}" for text in contents.animations]
+    lines += [f"texture: {text}" for text in contents.textures]
+    lines += [f"converted: {text}" for text in contents.converted]
+    meshes = Table(title="Meshes", title_justify="left")
+    for column in ("mesh", "vertices", "faces", "shapes", "in the rig"):
+        meshes.add_column(column, justify="left" if column in ("mesh", "in the rig") else "right")
+    for mesh in contents.meshes:
+        faces = str(mesh.faces) if mesh.faces else "-"
+        used = f"{'yes' if mesh.used else 'no'}, {mesh.reason}"
+        meshes.add_row(mesh.name, str(mesh.vertices), faces, str(mesh.shapes), used)
+    shapes = Table(
+        title="Shapes",
+        title_justify="left",
+        caption="strength: largest offset, 1 is the distance from eyes to mouth; moved: share of the vertices",
+        caption_justify="left",
+    )
+    shapes.add_column("shape", no_wrap=True)
+    for column in ("ARKit", "strength", "moved", "region", "side"):
+        shapes.add_column(column, justify="right" if column in ("strength", "moved") else "left")
+    for shape in facts.shapes:
+        known = "same" if shape.arkit == shape.name else shape.arkit or "-"
+        numbers = (f"{shape.strength:.3f}", f"{100 * shape.moved:.0f} %")
+        shapes.add_row(shape.name, known, *numbers, shape.region, shape.side)
+    lines += ["", meshes, shapes]
+    wrong = [*facts.problems, *(f"{shape.name} {text}" for shape in facts.shapes for text in shape.problems)]
+    lines += ["", f"Looks wrong ({len(wrong)}):" if wrong else "Nothing looks wrong"]
+    return [*lines, *(f"  {text}" for text in wrong)]
 
 
 def _check_out(path: Path, suffixes: tuple[str, ...]) -> None:

@@ -62,9 +62,13 @@ def test_help_names_every_command(capsys):
             ["--config FILE.toml", "--resume", "--run", "--source", "--target", "--source-clip", "--target-clip"],
         ),
         ("train", ["--training.steps INT", "Optimizer steps of ReenactNet.", "--images.no-residual", "{found,none}"]),
-        ("infer", ["infer [-h] RUN CLIP --out FILE [--reverse]", "Live Link Face"]),
+        (
+            "infer",
+            ["RUN", "CLIP", "--out FILE", "--reverse", "--fps", "--post.gain", "Live Link Face"],
+        ),
         ("evaluate", ["evaluate [-h] RUN [RUN ...]", "--frames INT", "--seed INT", "(one or more)"]),
-        ("convert", ["convert [-h] IN OUT [--rig RIG]"]),
+        ("convert", ["IN", "OUT", "--rig RIG", "--parts NAME", "--fps", "--post.smooth FLOAT"]),
+        ("inspect", ["--out FILE.png", "--json FILE.json", "--parts NAME", "looks wrong"]),
         ("rigs", ["--out FILE.png", "--size INT"]),
     ],
 )
@@ -78,7 +82,8 @@ def test_help_of_train_names_every_setting_and_its_default(capsys):
     for section, value in config_to_dict(Config()).items():
         for key, default in value.items() if isinstance(value, dict) else [("", value)]:
             option = f"{section}.{key}".rstrip(".").replace("_", "-")
-            found = re.search(rf"--{option}(, --\S+)? (\S+)( (?!--)\S+)*? \(default: {re.escape(str(default))}\)", text)
+            shown = "" if default in ((), {}) else str(default)
+            found = re.search(rf"--{option}(, --\S+)? (\S+)( (?!--)\S+)*? \(default: {re.escape(shown)}\)", text)
             assert found, option
 
 
@@ -171,10 +176,13 @@ def test_an_unknown_option_names_the_nearest(trained, capsys):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["infer", "{run}", "c.csv", "--out", "out.mp4"], "out.mp4: expected a name that ends in .csv or .npz or .glb"),
+        (
+            ["infer", "{run}", "c.csv", "--out", "out.mp4"],
+            "out.mp4: expected a name that ends in .csv or .npz or .json",
+        ),
         (
             ["infer", "{run}", "c.csv", "--out", "out"],
-            "out: expected a name that ends in .csv or .npz or .glb, got no suf",
+            "out: expected a name that ends in .csv or .npz or .json",
         ),
         (
             ["infer", "{run}", "c.csv", "--out", "no/where/out.csv"],
@@ -184,7 +192,7 @@ def test_an_unknown_option_names_the_nearest(trained, capsys):
         (["evaluate", "{run}/none"], "{run}/none: expected a run folder with config.toml in it, got none"),
         (["evaluate"], "evaluate: expected at least one run folder, got none"),
         (["convert", "{run}/rig.npz", "{run}/folder.glb"], "{run}/folder.glb: expected a file to write, got a folder"),
-        (["convert", "{run}/rig.npz", "rig.obj"], "rig.obj: expected a name that ends in .glb or .npz, got .obj"),
+        (["convert", "{run}/rig.npz", "rig.mtl"], "rig.mtl: expected a name that ends in .glb or .npz or .obj"),
         (["convert", "{run}/none.npz", "rig.glb"], "{run}/none.npz: no such file"),
         (["convert", "anny:mna", "rig.glb"], "anny:mna: no such character; did you mean anny:man?"),
         (["convert", "synthetic:1:1", "{run}/c.csv"], "synthetic:1:1: expected --rig beside this clip, got none"),
@@ -338,3 +346,51 @@ def test_idle_threads_sleep_unless_the_user_says_otherwise(given, policy):
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True, env=environment
     )
     assert done.stdout.strip() == policy
+
+
+def test_a_rate_that_is_asked_for_is_said_and_a_result_is_finished_as_asked(tmp_path, capsys, toy_rig):
+    save_rig(toy_rig, tmp_path / "ball.npz")
+    arguments = ["convert", "synthetic:3:2", f"{tmp_path / 'c.npz'}", "--rig", f"{tmp_path / 'ball.npz'}"]
+    assert main([*arguments, "--fps", "24", "--post.lock", "eyeBlink*", "0.25"]) == 0
+    assert "60 frames at 30 fps became 48 at 24" in capsys.readouterr().out
+    clip = load_clip(str(tmp_path / "c.npz"), toy_rig)
+    assert (len(clip), clip.fps) == (48, 24.0)
+    assert torch.equal(clip.weights[:, :2], torch.full((48, 2), 0.25))
+    assert "no shape is called jaw" in fails(capsys, *arguments, "--post.gain", "jaw", "2")
+
+
+def test_an_avatar_is_animated_and_keeps_what_it_had(tmp_path):
+    avatar = ROOT / "tests" / "fixtures" / "blender.glb"
+    assert main(["convert", "synthetic:3:1", f"{tmp_path / 'moved.glb'}", "--rig", f"{avatar}"]) == 0
+    kept, moved = load_rig(str(avatar)), load_rig(str(tmp_path / "moved.glb"))
+    assert torch.equal(kept.deltas, moved.deltas)
+    assert b"skins" in (tmp_path / "moved.glb").read_bytes()
+    again = load_clip(str(tmp_path / "moved.glb"), moved)
+    torch.testing.assert_close(again.weights, load_clip("synthetic:3:1", kept).weights, rtol=0, atol=1e-6)  # float32
+
+
+def test_an_animation_comes_along_with_its_rig(tmp_path, capsys):
+    avatar = ROOT / "tests" / "fixtures" / "blender.glb"
+    assert main(["convert", f"{avatar}", f"{tmp_path / 'x.glb'}"]) == 0
+    assert "12 frames at 24 fps" in capsys.readouterr().out
+    assert main(["convert", f"{avatar}", f"{tmp_path / 'x.npz'}", "--shapes", "eye*"]) == 0
+    assert load_rig(str(tmp_path / "x.npz")).names == ("eyeBlinkRight", "eyeBlinkLeft")
+
+
+def test_inspect_says_what_is_inside_and_draws_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    avatar = ROOT / "tests" / "fixtures" / "blender.glb"
+    assert main(["inspect", f"{avatar}", "--json", "facts.json", "--size", "32"]) == 0
+    text = capsys.readouterr().out
+    for words in ("115 vertices", "Khronos glTF Blender", "Teeth", "12 keys", "16 x 16, PNG", "jawOpen"):
+        assert words in text
+    assert "mouthSmileLeft has no partner on the other side" in text
+    with Image.open("blender-shapes.png") as sheet:
+        assert sheet.width >= 4 * 32
+    assert '"strength"' in Path("facts.json").read_text()
+
+
+def test_inspect_of_what_is_no_rig_is_one_sentence(tmp_path, capsys):
+    (tmp_path / "x.glb").write_bytes(b"glTF")
+    assert "expected a GLB file" in fails(capsys, "inspect", tmp_path / "x.glb")
+    assert "expected 16 to 1024 pixels" in fails(capsys, "inspect", "anny:man", "--size", 3)

@@ -9,6 +9,7 @@ from conftest import make_toy_rig
 from reenact.errors import ReenactError
 from reenact.portrait import EYE_HEIGHT, MAKEUP, MOUTH_HEIGHT, Portrait, face_lines, fit_weights, made_up
 from reenact.rigs import anny, motion
+from reenact.rigs.rig import Rig
 
 
 @pytest.mark.parametrize("name", sorted(anny.BUILT_IN))
@@ -104,3 +105,25 @@ def test_weights_are_found_from_a_picture_alone(seed):
     fitted = rig.vertices(fit_weights(portrait, portrait.render(goal, 128)["color"]))
     error = (fitted - goal).norm() / (goal - rig.neutral).norm()
     assert error < 0.02  # 0.001 and 0.0002 measured
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        # VRoid, MMD, VRM 1.0 and VRChat: nothing of ARKit, and a shape first that moves everything.
+        ("fat", "Fcl_EYE_Close_L", "Fcl_EYE_Close_R", "Fcl_BRW_Angry", "Fcl_MTH_A", "Fcl_MTH_U", "Fcl_MTH_Fun", "x"),
+        ("fat", "まばたき", "ウィンク", "困る", "あ", "う", "い", "口角上げ"),
+        ("fat", "blinkLeft", "blinkRight", "surprised", "aa", "ou", "ih", "oh"),
+        ("fat", "vrc.blink", "wink right", "angry", "vrc.v_aa", "vrc.v_ou", "vrc.v_ih", "vrc.v_oh"),
+    ],
+)
+def test_avatars_of_other_naming_on_a_body_are_framed_by_their_faces(names):
+    ball = make_toy_rig("ball")
+    body = torch.cat([ball.neutral, ball.neutral * 6 - torch.tensor([0.0, 0.8, 0.0])])
+    deltas = torch.cat([ball.deltas, torch.zeros_like(ball.deltas)], dim=1)
+    rig = Rig("avatar", body, torch.cat([0.2 * body[None], deltas]), names, torch.cat([ball.faces, ball.faces + 642]))
+    eyes, mouth = face_lines(rig)
+    expected_eyes, expected_mouth = face_lines(ball)
+    # Names tell the same lids; of the mouth they may mean other shapes than ARKit's, within a quarter of the face.
+    torch.testing.assert_close(eyes, expected_eyes, rtol=0, atol=0.003)
+    assert (mouth - expected_mouth).norm() < 0.25 * (expected_eyes - expected_mouth).norm()

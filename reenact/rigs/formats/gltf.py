@@ -69,7 +69,7 @@ def read(path: Path, choice: Choice = DEFAULT) -> tuple[Rig, Contents]:
     except ReenactError as error:
         text = str(error)
         raise error if text.startswith(str(path)) else ReenactError(f"{path}: {text}") from None
-    converted = [*(f"{kind} compression undone" for kind in sorted(document.decoded)), *scene.notes, *made.converted]
+    converted = [*(f"{kind} compression undone" for kind in sorted(document.decoded)), *scene.noted(), *made.converted]
     return made.rig, Contents(
         _format(document), made.meshes, tuple(dict.fromkeys(converted)), _animations(document), pictures.described()
     )
@@ -98,7 +98,14 @@ class _Scene:
     """Nodes that have a mesh, in the order of the tree."""
     worlds: dict[int, np.ndarray]
     """Transform of every node to world space (4, 4)."""
-    notes: list[str] = field(default_factory=list)
+    notes: dict[str, list[str]] = field(default_factory=dict)
+    """What was done, and to which meshes or shapes."""
+
+    def note(self, what: str, *names: str) -> None:
+        self.notes.setdefault(what, []).extend(name for name in names if name not in self.notes.get(what, []))
+
+    def noted(self) -> list[str]:
+        return [f"{what}: {', '.join(names)[:300]}" for what, names in self.notes.items()]
 
     @classmethod
     def of(cls, document: Document) -> _Scene:
@@ -227,7 +234,7 @@ def _piece(
     world = scene.worlds[index]
     if "skin" in node:
         world = _bound(document, scene, node, attributes, shapes, count)
-        scene.notes.append(f"{label}: skinned, taken as it was bound")
+        scene.note("skinned, taken as bound", label)
     faces = _triangles(document, primitive, attributes, mode, count, where)
     linear = world[:3, :3]
     if not np.array_equal(world, np.eye(4)):
@@ -235,7 +242,7 @@ def _piece(
         shapes = {name: offsets @ linear.T.astype(np.float32) for name, offsets in shapes.items()}
         size = float(np.cbrt(abs(np.linalg.det(linear))))
         if abs(size - 1) > 1e-3:
-            scene.notes.append(f"{label}: scaled by {size:.4g} as its nodes say")
+            scene.note(f"scaled by {size:.4g} as nodes say", label)
         if np.linalg.det(linear) < 0:
             faces = faces[:, ::-1]
     material, colors, image, uv, opacity = _surface(document, primitive, attributes, count, where)
@@ -454,7 +461,7 @@ def _expressions(document: Document, scene: _Scene) -> list[_Expression]:
             found.append(_Expression(name, tuple(_bind(document, bind, "mesh", 0.01, place) for bind in binds)))
     found = [expression for expression in found if expression.name and expression.binds]
     if found:
-        scene.notes.append(f"{len(found)} VRM expressions: {', '.join(each.name for each in found)[:300]}")
+        scene.note("VRM expressions", *(each.name for each in found))
     return found
 
 
@@ -486,7 +493,7 @@ def _with_expressions(
         alias = len(same) == 1 and all(len(part) == 1 and part[0][0] in same for part in moved)
         if alias and (same == {expression.name} or not matches(expression.name, choice.shapes)):
             if same != {expression.name}:
-                scene.notes.append(f"expression {expression.name} is the shape {next(iter(same))}")
+                scene.note("expressions that are a shape of another name", f"{expression.name} = {next(iter(same))}")
             continue
         name = expression.name if expression.name not in taken else f"{expression.name} (VRM)"
         if name in taken:
