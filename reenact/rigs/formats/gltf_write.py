@@ -5,10 +5,8 @@ Source: Khronos, glTF 2.0 Specification. What we write has no errors and no warn
 
 from __future__ import annotations
 
-import base64
 import io
 import json
-import mimetypes
 import struct
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,7 @@ from PIL import Image
 from reenact.errors import ReenactError
 from reenact.rigs.clip import Clip
 from reenact.rigs.formats import disk, gltf
-from reenact.rigs.formats.gltf_document import Document, open_document
+from reenact.rigs.formats.gltf_document import MESHOPT, Document, open_document
 from reenact.rigs.formats.pieces import to_linear
 from reenact.rigs.rig import PARTS, Rig
 
@@ -119,35 +117,48 @@ def animate(avatar: Path, clip: Clip, path: Path) -> tuple[str, ...]:
         )
     animation = {"name": "Reenact", "samplers": samplers, "channels": channels, "extras": {"fps": clip.fps}}
     root["animations"] = [animation, *root.get("animations", [])]
-    root.setdefault("buffers", [{}])[0]["byteLength"] = len(writer.data)
+    root["buffers"][0]["byteLength"] = len(writer.data)
     disk.write_bytes(path, _packed(root, bytes(writer.data)))
     still = (np.abs(weights) > 0).any(0) if len(weights) else np.zeros(len(clip.names), bool)
     return tuple(name for name, moves in zip(clip.names, still) if moves and name not in moved)
 
 
 def _own_buffers(document: Document) -> bytearray:
-    """Bytes of the first buffer, which becomes the file's own; other files that it refers to move into the JSON."""
+    """Bytes of all buffers one after another; views, and pictures beside the file, move into them."""
     root = document.root
-    buffers, images = root.setdefault("buffers", []), root.get("images", [])
-    for index, buffer in enumerate(buffers[1:], 1):
-        uri = buffer.get("uri")
-        if uri is not None and not uri.startswith("data:"):
-            buffer["uri"] = _data_uri(document.buffer(index, "glTF.buffers"), "application/octet-stream")
-    for index, image in enumerate(images):
-        uri = image.get("uri")
-        if uri is not None and not uri.startswith("data:"):
-            kind = mimetypes.guess_type(uri)[0] or "image/png"
-            image["uri"] = _data_uri(document.uri(uri, f"images[{index}].uri"), kind)
-    if not buffers:
-        buffers.append({})
-        return bytearray()
-    first = bytearray(document.buffer(0, "glTF.buffers"))
-    buffers[0].pop("uri", None)
-    return first
+    data, places, kept = bytearray(), {}, []
+    for index, buffer in enumerate(root.get("buffers", [])):
+        if "uri" not in buffer and index:
+            kept.append(index)  # a stand-in for what a compressed view holds: it has no bytes
+            continue
+        data += b"\0" * (-len(data) % 8)
+        places[index] = len(data)
+        data += document.buffer(index, "glTF.buffers")
+    numbers = {index: 1 + number for number, index in enumerate(kept)}
+    for view in root.get("bufferViews", []):
+        for part in (view, *(view.get("extensions", {}).get(name, {}) for name in MESHOPT)):
+            if part.get("buffer") in places:
+                part["byteOffset"] = part.get("byteOffset", 0) + places[part["buffer"]]
+                part["buffer"] = 0
+            elif part.get("buffer") in numbers:
+                part["buffer"] = numbers[part["buffer"]]
+    root["buffers"] = [{}, *(root["buffers"][index] for index in kept)]
+    for index, image in enumerate(root.get("images", [])):
+        if "uri" in image:
+            picture = document.uri(image.pop("uri"), f"images[{index}].uri")
+            data += b"\0" * (-len(data) % 8)
+            root.setdefault("bufferViews", []).append(
+                {"buffer": 0, "byteOffset": len(data), "byteLength": len(picture)}
+            )
+            image |= {"bufferView": len(root["bufferViews"]) - 1, "mimeType": _picture_kind(picture)}
+            data += picture
+    return data
 
 
-def _data_uri(data: bytes, kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+def _picture_kind(data: bytes) -> str:
+    if data[:3] == b"\xff\xd8\xff":
+        return "image/jpeg"
+    return "image/webp" if data[8:12] == b"WEBP" else "image/png"
 
 
 def _packed(root: dict[str, Any], data: bytes) -> bytes:
