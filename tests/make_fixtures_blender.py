@@ -17,7 +17,7 @@ import bpy
 import numpy as np
 
 FOLDER = Path(__file__).parent / "fixtures"
-NAMES = ("jawOpen", "eyeBlinkLeft", "eyeBlinkRight", "mouthLowerDownLeft", "browInnerUp", "cheekPuff")
+NAMES = ("jawOpen", "eyeBlinkLeft", "eyeBlinkRight", "mouthSmileLeft", "browInnerUp", "cheekPuffOfBothSides")
 FRAMES, FPS = 12, 24
 PLACE = (0.0, 0.03, 1.5)  # of the armature in Blender's world, metres
 
@@ -66,9 +66,9 @@ def parts():
                 "jawOpen": jaw_drop,
                 "eyeBlinkLeft": bump(face, (3.2, 3.2, 4), 1.7, (0, -1.1, 0.2)),
                 "eyeBlinkRight": bump(face, (-3.2, 3.2, 4), 1.7, (0, -1.1, 0.2)),
-                "mouthLowerDownLeft": bump(face, (2.5, -5, 5), 1.5, (0.8, 0.7, -0.3)),
+                "mouthSmileLeft": bump(face, (2.5, -5, 5), 1.5, (0.8, 0.7, -0.3)),
                 "browInnerUp": bump(face, (0, 6, 5), 3.0, (0, 1.2, 0.3)),
-                "cheekPuff": bump(face, (0, -2, 0), 20.0, (0, 0, 1.5)),
+                "cheekPuffOfBothSides": bump(face, (0, -2, 0), 20.0, (0, 0, 1.5)),
             },
         ),
         "Eyes": (
