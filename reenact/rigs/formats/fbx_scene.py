@@ -1,7 +1,8 @@
 """What an FBX file says, as plain arrays; runs in a process of its own, see `isolated`.
 
 The package `ufbx` 0.0.5 remembers the Python object of an element without holding it: one that is asked for again after
-it was dropped is freed memory. So every element is held as long as the scene is read.
+it was dropped is freed memory, and dropping it shortens its name where that is still in use. So every element is held
+until the process ends, and text is copied.
 """
 
 from __future__ import annotations
@@ -13,6 +14,9 @@ import numpy as np
 import ufbx
 
 from reenact.errors import ReenactError
+
+_HELD: list[Any] = []
+"""Elements of the scene; never emptied."""
 
 
 def scene(path: Path) -> dict[str, Any]:
@@ -37,7 +41,9 @@ def scene(path: Path) -> dict[str, Any]:
         raise ReenactError(
             f"{path}: expected an FBX file, it is damaged or something else ({' '.join(str(error).split())[:160]})"
         ) from None
-    held = [*loaded.elements]
+    _HELD.append(loaded)
+    held = _HELD
+    held += [*loaded.elements]
     meshes = [*loaded.meshes]
     held += [*meshes, *loaded.nodes, *loaded.materials, *loaded.textures, *loaded.videos, *loaded.anim_stacks]
     held += [*loaded.blend_deformers, *loaded.blend_channels, *loaded.blend_shapes]
@@ -51,18 +57,16 @@ def scene(path: Path) -> dict[str, Any]:
         channels += animated
     settings, facts = loaded.settings, loaded.metadata
     turn = facts.root_rotation
-    answer = {
+    return {
         "meshes": found,
         "pictures": pictures,
         "animations": _animations(path, loaded, channels, float(settings.frames_per_second), held),
         "rate": float(settings.frames_per_second),
         "meters": float(settings.original_unit_meters),
         "turned": bool(abs(turn.w) < 1 - 1e-9),
-        "creator": str(facts.creator)[:80],
+        "creator": _text(facts.creator)[:80],
         "notes": list(dict.fromkeys(notes)),
     }
-    del held
-    return answer
 
 
 def _mesh(
@@ -75,7 +79,7 @@ def _mesh(
     corners = np.array(mesh.vertex_indices, np.int64)
     begins, counts = faces[:, 0], faces[:, 1]
     if len(faces) and ((counts < 0) | (begins < 0) | (begins + counts > len(corners))).any():
-        raise ReenactError(f"{path}: a face of {mesh.name[:60]} lies outside its {len(corners)} corners")
+        raise ReenactError(f"{path}: a face of {_text(mesh.name)[:60]} lies outside its {len(corners)} corners")
     order = np.repeat(begins - np.cumsum(counts) + counts, counts) + np.arange(int(counts.sum()))
     shapes: dict[str, list[np.ndarray]] = {}
     channels = []
@@ -85,11 +89,12 @@ def _mesh(
             target = channel.target_shape
             held += [channel, target]
             # Maya puts the deformer's name before the channel's.
-            name = channel.name.removeprefix(f"{deformer.name}.") or (target.name if target is not None else "")
+            name = _text(channel.name).removeprefix(f"{_text(deformer.name)}.")
+            name = name or (_text(target.name) if target is not None else "")
             channels.append((name, channel))
             if target is None or name in shapes:
                 if name in shapes:
-                    notes.append(f"{mesh.name}: two channels are called {name}; the first counts")
+                    notes.append(f"{_text(mesh.name)}: two channels are called {name}; the first counts")
                 continue
             steps = channel.keyframes
             held.append(steps)
@@ -118,7 +123,7 @@ def _mesh(
     entries = []
     for node in nodes:
         if not node.visible:
-            notes.append(f"{node.name}: hidden; left out")
+            notes.append(f"{_text(node.name)}: hidden; left out")
             continue
         materials = [*node.materials] or [*mesh.materials]
         held += materials
@@ -126,8 +131,8 @@ def _mesh(
         known = len(material) == len(faces) and len(surfaces) > 0
         surfaces = surfaces or [_PLAIN]
         placed = {
-            "name": node.name or mesh.name,
-            "label": f"{node.name} {mesh.name}",
+            "name": _text(node.name) or _text(mesh.name),
+            "label": f"{_text(node.name)} {_text(mesh.name)}",
             "matrix": _placed(node, mesh, held, notes),
             "surfaces": surfaces,
             "surface": material.clip(0, len(surfaces) - 1) if known else np.zeros(len(faces), np.int64),
@@ -159,9 +164,14 @@ def _placed(node: Any, mesh: Any, held: list[Any], notes: list[str]) -> np.ndarr
             bound.append((float(np.abs(np.array(cluster.weights, np.float64)).sum()), world @ to_bone))
     if not bound:
         return matrix
-    notes.append(f"{node.name}: skinned; taken as it was bound")
+    notes.append(f"{_text(node.name)}: skinned; taken as it was bound")
     heaviest = max(bound, key=lambda pair: pair[0])[1]
     return heaviest if np.isfinite(heaviest).all() else matrix
+
+
+def _text(value: str) -> str:
+    """The same text in memory of its own."""
+    return value.encode("utf-8", "replace").decode("utf-8", "replace")
 
 
 def _matrix(value: Any) -> np.ndarray:
@@ -175,7 +185,7 @@ _PLAIN = {"name": "", "color": [1.0, 1.0, 1.0], "picture": None, "opacity": 1.0}
 
 
 def _surface(material: Any, held: list[Any], pictures: dict[str, bytes | str], notes: list[str]) -> dict[str, Any]:
-    surface = {**_PLAIN, "name": material.name}
+    surface = {**_PLAIN, "name": _text(material.name)}
     pbr, fbx = material.pbr, material.fbx
     held += [pbr, fbx]
     base, factor, opacity = pbr.base_color, pbr.base_factor, pbr.opacity
@@ -200,7 +210,10 @@ def _picture(texture: Any, held: list[Any], pictures: dict[str, bytes | str]) ->
     files = [*texture.file_textures]
     held += files
     texture = files[0] if files else texture
-    key = texture.relative_filename or texture.filename or texture.absolute_filename or texture.name
+    key = next(
+        filter(None, map(_text, (texture.relative_filename, texture.filename, texture.absolute_filename, texture.name))),
+        None,
+    )
     if not key:
         return None
     if key not in pictures:
@@ -228,7 +241,7 @@ def _animations(
         if not (np.isfinite([begin, end]).all() and begin <= end) or not names:
             continue
         if (end - begin) * rate * len(names) > 1 << 25:
-            raise ReenactError(f"{path}: the animation {stack.name[:60]} lasts {end - begin:g} s, too long")
+            raise ReenactError(f"{path}: the animation {_text(stack.name)[:60]} lasts {end - begin:g} s, too long")
         times = begin + np.arange(round((end - begin) * rate) + 1) / rate
         weights = np.full((len(times), len(names)), np.nan)
         for name, channel in channels:
@@ -236,6 +249,6 @@ def _animations(
             if np.isnan(weights[0, column]):  # where two meshes disagree, the first counts
                 weights[:, column] = [channel.evaluate_blend_weight(anim, float(time)) for time in times]
         takes.append(
-            {"name": stack.name, "names": names, "weights": weights, "rate": rate}
+            {"name": _text(stack.name), "names": names, "weights": weights, "rate": rate}
         )
     return takes
