@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -75,7 +76,8 @@ def read_rig(name_or_path: str, choice: Choice = DEFAULT) -> tuple[Rig, Contents
                 f"{path}: expected a rig, found a clip (it has weights); give it where a clip is asked for"
             )
         return reduced(npz.load(path), choice, "Reenact's own arrays")
-    return _module(_MODULES[suffix]).read(path, choice)
+    with _naming(path):
+        return _module(_MODULES[suffix]).read(path, choice)
 
 
 def save_rig(rig: Rig, path: str | Path, clip: Clip | None = None) -> None:
@@ -194,7 +196,23 @@ def _synthetic(text: str, rig: Rig) -> Clip:
     return motion.synthesize(rig.names, seconds, int(seed), kind=kind)
 
 
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Errors within say which file they are about."""
+    try:
+        yield
+    except ReenactError as error:
+        if str(path) in str(error):
+            raise
+        raise ReenactError(f"{path}: {str(error).removeprefix('clip: ')}") from None
+
+
 def _read_clip(path: Path) -> Clip:
+    with _naming(path):
+        return _clip_of(path)
+
+
+def _clip_of(path: Path) -> Clip:
     suffix = path.suffix.lower()
     if suffix == ".npz":
         if "neutral" in npz.contents(path):
@@ -207,9 +225,9 @@ def _read_clip(path: Path) -> Clip:
         livelink = _module("livelink")
         audio2face = _module("audio2face")
         header = table.header(path)
-        if livelink.is_livelink(header):
-            return livelink.load(path)
-        return audio2face.load_csv(path) if audio2face.is_audio2face_csv(header) else table.load_csv(path)
+        if audio2face.is_audio2face_csv(header):
+            return audio2face.load_csv(path)
+        return livelink.load(path) if livelink.is_livelink(header) else table.load_csv(path)
     if suffix == ".json":
         json_table, audio2face = _module("json_table"), _module("audio2face")
         return (audio2face if audio2face.is_audio2face(json_table.read(path)) else json_table).load(path)

@@ -24,7 +24,7 @@ from PIL import Image
 from reenact.errors import ReenactError
 from reenact.rigs.clip import Clip
 from reenact.rigs.formats import disk
-from reenact.rigs.formats.gltf_document import COMPONENTS, DRACO, Document, open_document
+from reenact.rigs.formats.gltf_document import COMPONENTS, DRACO, WIDTHS, Document, open_document
 from reenact.rigs.formats.pieces import DEFAULT, Choice, Contents, Piece, assemble, matches, part_named
 from reenact.rigs.rig import PARTS, Rig
 from reenact.rigs.timeline import steady
@@ -290,8 +290,12 @@ class _Attributes:
         place = f"{self.where}.attributes.{name}"
         if name in self.unpacked:
             values = self.unpacked[name]
-            if count is not None and len(values) != count:
-                raise self.document.fail(f"expected {place} with {count} elements, got {len(values)}")
+            widths = [WIDTHS[kind] for kind in kinds]
+            if values.shape[1] not in widths or len(values) != (count or len(values)):
+                raise self.document.fail(
+                    f"expected {place} with {count or 'any number of'} elements of {' or '.join(kinds)}, got "
+                    f"{len(values)} of {values.shape[1]}"
+                )
             return values
         return self.document.accessor(self.entries.get(name), place, kinds, count)
 
@@ -359,7 +363,7 @@ def _bound(
     share = attributes.read("WEIGHTS_0", ("VEC4",), count).astype(np.float64)
     if chosen.min() < 0 or chosen.max() >= len(joints):
         raise document.fail(f"expected JOINTS_0 below {len(joints)}, got {chosen.max()}")
-    moved = sum((np.abs(offsets).sum(1) for offsets in shapes.values()), start=np.zeros(count))
+    moved = sum((np.abs(offsets).sum(1, dtype=np.float64) for offsets in shapes.values()), start=np.zeros(count))
     if not moved.any():
         moved = np.ones(count)
     carried = np.bincount(chosen.reshape(-1), (share * moved[:, None]).reshape(-1), len(joints))

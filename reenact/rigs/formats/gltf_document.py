@@ -44,7 +44,8 @@ UNDERSTOOD = frozenset(
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 """Component types of accessors."""
 
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+"""Numbers in an element of each type of accessor."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ class Document:
 
     def view(self, index: Any, where: str) -> tuple[bytes, int, int, int | None]:
         """Buffer, start, length and stride of a buffer view, within its buffer; unpacked where it was packed."""
-        if index in self._views and not isinstance(index, bool):
+        if type(index) is int and index in self._views:
             return self._views[index]
         view = self.item("bufferViews", index, where)
         name = f"bufferViews[{index}]"
@@ -192,7 +193,7 @@ class Document:
             raise self.fail(f"expected {name} of type {' or '.join(kinds)}, got {kind[:20]} of component type {code}")
         if length < 1 or (count is not None and length != count):
             raise self.fail(f"expected {name} with {count or 'one or more'} elements, got {length}")
-        dtype, width = COMPONENTS[code], _WIDTHS[kind]
+        dtype, width = COMPONENTS[code], WIDTHS[kind]
         offset = self.get(entry, "byteOffset", int, name, 0)
         sparse = self.get(entry, "sparse", dict, name, None)
         view = self.get(entry, "bufferView", int, name, None)

@@ -162,6 +162,10 @@ def assemble(
             f"{where}: {len(names)} shapes of {total} vertices are more than {disk.LIMIT:,} bytes; choose fewer with "
             "--shapes or --parts"
         )
+    for piece in pieces:
+        for array in (piece.positions, *piece.shapes.values()):
+            if len(array) and not np.abs(array).max() < 1e15:
+                raise ReenactError(f"{where}: {piece.mesh} has coordinates beyond all bounds; export the mesh again")
     pieces = [_without_holes(piece, converted) for piece in pieces]
     starts = np.cumsum([0, *(len(piece.positions) for piece in pieces)])
     positions = np.concatenate([piece.positions for piece in pieces]).astype(np.float32)
@@ -318,7 +322,7 @@ def _moving_box(pieces: Sequence[Piece]) -> tuple[np.ndarray, np.ndarray] | None
     points, lengths = [], []
     for piece in pieces:
         for offsets in piece.shapes.values():
-            length = np.linalg.norm(offsets, axis=1)
+            length = np.linalg.norm(offsets.astype(np.float64), axis=1)
             moving = length > 0
             points.append(piece.positions[moving])
             lengths.append(length[moving])
