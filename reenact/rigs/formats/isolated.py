@@ -48,7 +48,9 @@ def read(path: Path, task: str, noun: str) -> dict[str, Any]:
     limit = MEMORY + 4 * size
     seconds = SECONDS + SECONDS_PER_MEGABYTE * size / 1e6
     root = Path(__file__).resolve().parents[3]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
+    # An empty entry would be the current folder.
+    places = [str(root), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
     environment.setdefault("OMP_NUM_THREADS", "1")
     # -P: a module in the current folder must not be taken for one of ours.
     command = [sys.executable, "-P", "-m", __name__, task, str(path.resolve()), str(path), str(limit)]

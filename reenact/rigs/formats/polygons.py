@@ -7,7 +7,7 @@ has triangles, one colour per vertex and one picture; what that costs is decided
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,38 +36,38 @@ class Surface:
 
 @dataclass(frozen=True)
 class Mesh:
-    """A mesh as it stands in a file."""
+    """A mesh as it stands in a file, true or not: sizes and indices are checked by `pieces_of`."""
 
     name: str
-    positions: Float[np.ndarray, "V 3"]
+    positions: Float[np.ndarray, "_ 3"]
     names: tuple[str, ...]
     """Shapes, all different, in the order of the file."""
-    shapes: Mapping[str, tuple[Int[np.ndarray, "N"] | None, Float[np.ndarray, "N 3"]]]
+    shapes: Mapping[str, tuple[Int[np.ndarray, "_"] | None, Float[np.ndarray, "_ 3"]]]
     """Vertices that move, None for all, and by how much; those of `names` that move nothing may be left out."""
-    counts: Int[np.ndarray, "P"]
+    counts: Int[np.ndarray, "_"]
     """Corners of each face."""
-    corners: Int[np.ndarray, "C"]
+    corners: Int[np.ndarray, "_"]
     """Vertex of each corner, face after face."""
     matrix: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     """To metres, +Y up, applied to columns."""
     clockwise: bool = False
     """Whether corners go clockwise seen from outside."""
-    uv: Float[np.ndarray, "U 2"] | None = None
+    uv: Float[np.ndarray, "_ 2"] | None = None
     """(0, 0) top left."""
-    uv_corners: Int[np.ndarray, "C"] | None = None
+    uv_corners: Int[np.ndarray, "_"] | None = None
     """uv of each corner; None where uv go with the vertices."""
-    colors: Float[np.ndarray, "V 3"] | None = None
+    colors: Float[np.ndarray, "_ 3"] | None = None
     """Linear."""
     surfaces: tuple[Surface, ...] = (Surface(),)
-    surface: Int[np.ndarray, "P"] | None = None
+    surface: Int[np.ndarray, "_"] | None = None
     """Index into `surfaces` of each face; None where it is 0 for all."""
     label: str = ""
     """What mesh and node are called, for the part."""
     labels: tuple[str, ...] = ()
     """What groups of faces are called, for the part."""
-    group: Int[np.ndarray, "P"] | None = None
+    group: Int[np.ndarray, "_"] | None = None
     """Index into `labels` of each face."""
-    part: Int[np.ndarray, "V"] | None = None
+    part: Int[np.ndarray, "_"] | None = None
     """Index into `PARTS`, where the file says it."""
 
 
@@ -113,9 +113,8 @@ def pieces_of(where: Path, mesh: Mesh) -> list[Piece]:
         owned = np.union1d(faces[mine], np.setdiff1d(whole, faces)) if key == keys[0] else np.unique(faces[mine])
         vertex = whole if len(keys) == 1 else owned
         pieces.append(_piece(mesh, positions, shapes, part, vertex, faces[mine], place[mine], surface[mine], key))
-        if len(keys) > 1:
-            pieces[-1] = _seamed(pieces[-1])
-    return pieces
+    # Pieces of one mesh are closed again along their borders, where nothing else differs.
+    return pieces if len(pieces) == 1 else [replace(piece, split=True) for piece in pieces]
 
 
 def _piece(
@@ -165,13 +164,6 @@ def _piece(
         label=f"{mesh.label} {names}",
         cutout=opacity if (opacity < 0.5).any() else None,
     )
-
-
-def _seamed(piece: Piece) -> Piece:
-    """The piece with a border to others of its mesh, which is closed again where nothing else differs."""
-    from dataclasses import replace
-
-    return replace(piece, split=True)
 
 
 def _picture(mesh: Mesh, index: int) -> Hashable | None:
