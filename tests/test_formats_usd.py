@@ -21,7 +21,7 @@ from reenact.rigs.formats.pieces import Choice
 from reenact.rigs.rig import PARTS, Rig
 
 pytest.importorskip("pxr")
-from reenact.rigs.formats import usd  # noqa: E402
+from reenact.rigs.formats import usd
 
 
 def make_clip(rig: Rig, frames: int = 12, fps: float = 30.0) -> Clip:
@@ -496,9 +496,7 @@ def test_a_subset_of_faces_that_are_not_there_is_refused(indices, tmp_path):
 
 
 def test_uv_and_colours_of_a_wrong_number(tmp_path):
-    rig, contents = usd.read(
-        write(tmp_path, FIRST + square(more=UV.replace("(1, 1), ", "").replace("HOW", "vertex")))
-    )
+    rig, contents = usd.read(write(tmp_path, FIRST + square(more=UV.replace("(1, 1), ", "").replace("HOW", "vertex"))))
     assert rig.uv is None
     assert "face: uv UVMap do not fit the mesh; left out" in contents.converted
     with pytest.raises(ReenactError, match=r"expected 4 colours \(vertex\), got 1"):
@@ -659,5 +657,7 @@ def test_2000_mutated_files_load_or_are_refused(suffix, tmp_path):
 
 
 def test_the_reading_process_does_not_load_torch():
-    code = "import reenact.rigs.formats.usd_scene, reenact.rigs.formats.isolated, sys; assert 'torch' not in sys.modules"
+    code = (
+        "import reenact.rigs.formats.usd_scene, reenact.rigs.formats.isolated, sys; assert 'torch' not in sys.modules"
+    )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])

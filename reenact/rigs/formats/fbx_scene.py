@@ -211,7 +211,9 @@ def _picture(texture: Any, held: list[Any], pictures: dict[str, bytes | str]) ->
     held += files
     texture = files[0] if files else texture
     key = next(
-        filter(None, map(_text, (texture.relative_filename, texture.filename, texture.absolute_filename, texture.name))),
+        filter(
+            None, map(_text, (texture.relative_filename, texture.filename, texture.absolute_filename, texture.name))
+        ),
         None,
     )
     if not key:
@@ -238,6 +240,8 @@ def _animations(
         anim = stack.anim
         held += [stack, anim]
         begin, end = float(stack.time_begin), float(stack.time_end)
+        if begin == end:  # a take that does not say when it ends lasts as long as its keys
+            begin, end = _span(loaded, held)
         if not (np.isfinite([begin, end]).all() and begin <= end) or not names:
             continue
         if (end - begin) * rate * len(names) > 1 << 25:
@@ -248,7 +252,16 @@ def _animations(
             column = names.index(name)
             if np.isnan(weights[0, column]):  # where two meshes disagree, the first counts
                 weights[:, column] = [channel.evaluate_blend_weight(anim, float(time)) for time in times]
-        takes.append(
-            {"name": _text(stack.name), "names": names, "weights": weights, "rate": rate}
-        )
+        takes.append({"name": _text(stack.name), "names": names, "weights": weights, "rate": rate})
     return takes
+
+
+def _span(loaded: Any, held: list[Any]) -> tuple[float, float]:
+    """Time of the first and of the last key."""
+    times = []
+    for curve in [*loaded.anim_curves]:
+        keys = curve.keyframes
+        held += [curve, keys]
+        if len(keys):
+            times += [float(keys[0].time), float(keys[len(keys) - 1].time)]
+    return (min(times), max(times)) if times else (0.0, 0.0)

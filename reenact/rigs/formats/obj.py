@@ -595,7 +595,9 @@ def save(rig: Rig, path: Path, clip: Clip | None = None) -> None:
         raise ReenactError(f"{path}: cannot be written ({error.strerror}); choose a folder that exists") from error
     others -= {"neutral.obj", *(f"{stem}.obj" for stem in stems)}
     if others:
-        raise ReenactError(f"{path}: holds other .obj files ({', '.join(sorted(others))[:100]}); choose an empty folder")
+        raise ReenactError(
+            f"{path}: holds other .obj files ({', '.join(sorted(others))[:100]}); choose an empty folder"
+        )
     arrays = {key: value.detach().cpu().numpy() for key, value in vars(rig).items() if isinstance(value, torch.Tensor)}
     positions = _lines("%.9g %.9g %.9g", arrays["neutral"])
     neutral = np.array(" ".join(positions).split(), dtype="S").astype(np.float64).reshape(-1, 3)  # as it is read

@@ -229,7 +229,11 @@ def _check(where: Path, mesh: Mesh) -> None:
         got = len(mesh.uv) if mesh.uv_corners is None else len(mesh.uv_corners)
         if got != have:
             raise ReenactError(f"{name}: expected {have} uv, got {got}; export it with its uv map again")
-        if mesh.uv_corners is not None and have and not 0 <= mesh.uv_corners.min() <= mesh.uv_corners.max() < len(mesh.uv):
+        if (
+            mesh.uv_corners is not None
+            and have
+            and not 0 <= mesh.uv_corners.min() <= mesh.uv_corners.max() < len(mesh.uv)
+        ):
             raise ReenactError(f"{name}: a face names a uv outside 0..{len(mesh.uv) - 1}")
     for noun, index, size in (
         ("material", mesh.surface, len(mesh.surfaces)),

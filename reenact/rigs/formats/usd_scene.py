@@ -244,7 +244,9 @@ class _Reader:
         api = UsdGeom.PrimvarsAPI(prim)
         kinds = (Sdf.ValueTypeNames.TexCoord2fArray, Sdf.ValueTypeNames.Float2Array, Sdf.ValueTypeNames.TexCoord2hArray,
                  Sdf.ValueTypeNames.TexCoord2dArray)  # fmt: skip
-        found = {each.GetPrimvarName(): each for each in api.FindPrimvarsWithInheritance() if each.GetTypeName() in kinds}
+        found = {
+            each.GetPrimvarName(): each for each in api.FindPrimvarsWithInheritance() if each.GetTypeName() in kinds
+        }
         for name in (*sorted(readers), "st", *found):
             if name not in found or not found[name].HasValue():
                 continue
@@ -413,7 +415,11 @@ def _per_vertex(
         return np.repeat(values, count, axis=0)
     if how not in ("uniform", "faceVarying"):
         return values
-    if counts.sum() != len(corners) or (counts < 0).any() or (len(corners) and not 0 <= corners.min() <= corners.max() < count):
+    if (
+        counts.sum() != len(corners)
+        or (counts < 0).any()
+        or (len(corners) and not 0 <= corners.min() <= corners.max() < count)
+    ):
         return np.ones((count, 3), np.float32)  # said of the mesh later
     each = np.repeat(values, counts, axis=0) if how == "uniform" else values
     total = np.stack([np.bincount(corners, each[:, axis], count) for axis in range(3)], axis=1)
