@@ -6,6 +6,7 @@ section 3: render the source, redraw it as the target with ReenactNet, read the 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -61,7 +62,7 @@ class ImageRetargeter:
                 f"{', '.join(clip.names[:3])} and so on; `reenact.rigs.files.conform` gives it those"
             )
         weights = [self._retarget(chunk) for chunk in clip.weights.split(_CHUNK)]
-        return Clip(self.target.names, torch.cat(weights), clip.fps)
+        return replace(clip, names=self.target.names, weights=torch.cat(weights))
 
     @torch.inference_mode()
     def step(self, weights: Float[Tensor, "Ks"]) -> Float[Tensor, "Kt"]:

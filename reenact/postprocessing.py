@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -45,7 +46,7 @@ def postprocess(clip: Clip, config: PostConfig) -> Clip:
     if config.lock:
         held = _per_shape(clip.names, config.lock, torch.nan, "lock").to(weights)
         weights = torch.where(held.isnan(), weights, held)
-    return clip if weights is clip.weights else Clip(clip.names, weights, clip.fps)
+    return clip if weights is clip.weights else replace(clip, weights=weights)
 
 
 def calibrated(weights: Float[Tensor, "T K"], rest: Float[Tensor, "K"]) -> Float[Tensor, "T K"]:

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 import torch
 
+from reenact.config import PostConfig
 from reenact.errors import ReenactError
+from reenact.postprocessing import postprocess
 from reenact.rigs import arkit, motion
 from reenact.rigs.clip import Clip
 from reenact.rigs.formats import livelink
+from reenact.rigs.timeline import resampled
 
 TAKE = Path(__file__).parents[2] / "shared" / "clips" / "arkit_capture_dao.csv"
 
@@ -65,18 +68,29 @@ def test_what_is_not_loaded_is_said(tmp_path):
     header = "Timecode,BlendShapeCount,JawOpen,HeadYaw,HeadPitch,Smirk"
     path = write(tmp_path / "t.csv", "00:00:00:00,61,0.5,0.1,0.0,0", header=header)
     with pytest.warns(UserWarning, match="not loaded") as caught:
-        livelink.load(path)
+        clip = livelink.load(path)
     assert [str(warning.message).split(": ", 1)[1] for warning in caught] == [
-        "rotations are not loaded: HeadYaw; the weights of the blendshapes are",
         "columns that are no ARKit shape are not loaded: Smirk",
     ]
+    np.testing.assert_allclose(clip.rotations, [[0.1, 0, 0, 0, 0, 0, 0, 0, 0]])
+
+
+def test_rotations_pass_through_and_come_back(tmp_path):
+    generator = torch.Generator().manual_seed(1)
+    weights, turns = torch.rand(40, 52, generator=generator), torch.randn(40, 9, generator=generator)
+    clip = Clip(arkit.NAMES, weights, 60.0, turns)
+    livelink.save(postprocess(clip, PostConfig(gain={"*": 0.5})), tmp_path / "take.csv")
+    again = livelink.load(tmp_path / "take.csv")
+    torch.testing.assert_close(again.rotations, turns, rtol=0, atol=2e-7)  # eight decimals, float32 of up to 4
+    torch.testing.assert_close(resampled(again, 30.0).rotations, again.rotations[::2])
 
 
 def test_a_recorded_take_with_odd_hours_and_gaps_loads_at_60_fps():
     if not TAKE.exists():
         pytest.skip("the recorded take is test data that only some machines have")
-    with pytest.warns(UserWarning, match="rotations are not loaded"):
-        clip = livelink.load(TAKE)
+    clip = livelink.load(TAKE)
+    assert clip.rotations is not None
+    assert clip.rotations.abs().max() < 1.6  # radians of a head
     assert clip.names == arkit.NAMES
     assert (len(clip), clip.fps) == (187, 60.0)  # 180 rows
     first = [float(cell) for cell in TAKE.read_text().splitlines()[1].split(",")[2:54]]

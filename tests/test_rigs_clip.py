@@ -25,3 +25,12 @@ BAD = {
 def test_a_clip_that_cannot_work_is_refused(names, weights, fps, message):
     with pytest.raises(ReenactError, match=message):
         Clip(names, weights, fps)
+
+
+@pytest.mark.parametrize(
+    ("rotations", "message"),
+    [(torch.zeros(3, 9), r"expected rotations \(2, 9\)"), (torch.full((2, 9), torch.inf), "rotations must be finite")],
+)
+def test_rotations_are_nine_finite_numbers_a_frame(rotations, message):
+    with pytest.raises(ReenactError, match=message):
+        Clip(("a",), torch.zeros(2, 1), 30.0, rotations)

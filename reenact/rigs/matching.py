@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -41,7 +42,7 @@ def conform(clip: Clip, rig: Rig, where: str = "clip") -> Clip:
         warnings.warn(f"{where}: shapes that {rig.name} lacks are left out: {', '.join(lost)}", stacklevel=2)
     if still:
         warnings.warn(f"{where}: shapes of {rig.name} that it lacks stay at 0: {', '.join(still)}", stacklevel=2)
-    return Clip(rig.names, clip.weights @ mixing, clip.fps)
+    return replace(clip, names=rig.names, weights=clip.weights @ mixing)
 
 
 def matching(given: Sequence[str], wanted: Sequence[str]) -> Float[Tensor, "given wanted"]:

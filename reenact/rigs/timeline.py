@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -72,10 +74,14 @@ def resampled(clip: Clip, fps: float) -> Clip:
     if not 1 <= fps <= 1000:
         raise ReenactError(f"expected 1 to 1000 frames per second, got {fps:g}")
     if fps == clip.fps or len(clip) == 0:
-        return Clip(clip.names, clip.weights, fps)
+        return replace(clip, fps=fps)
     last = (len(clip) - 1) / clip.fps
     places = torch.arange(int(last * fps + 1e-6) + 1, dtype=torch.float64) * (clip.fps / fps)
     before = places.floor().long().clamp(max=len(clip) - 1)
     share = (places - before).to(clip.weights)[:, None]
     after = (before + 1).clamp(max=len(clip) - 1)
-    return Clip(clip.names, clip.weights[before] * (1 - share) + clip.weights[after] * share, fps)
+    weights = clip.weights[before] * (1 - share) + clip.weights[after] * share
+    rotations = clip.rotations
+    if rotations is not None:
+        rotations = rotations[before] * (1 - share) + rotations[after] * share
+    return replace(clip, weights=weights, fps=fps, rotations=rotations)

@@ -22,8 +22,7 @@ from reenact.rigs.formats import disk, table
 from reenact.rigs.timeline import steady
 
 ROTATIONS = tuple(part + turn for part in ("Head", "LeftEye", "RightEye") for turn in ("Yaw", "Pitch", "Roll"))
-"""Columns after the weights, in radians. A `Clip` has no place for them: they are not loaded, and written as 0; where
-the eyes look is also in the eyeLook weights."""
+"""Columns after the weights, in radians: `Clip.rotations`."""
 
 
 def is_livelink(header: list[str]) -> bool:
@@ -34,7 +33,8 @@ def is_livelink(header: list[str]) -> bool:
 def load(path: Path) -> Clip:
     """The take, by ARKit names in the order of the file. Rows without a tracked face count as dropped.
 
-    Warns about rotations that move, and about columns that are no ARKit shapes; neither is loaded.
+    Rotations are there where the file has any; those that it lacks, or leaves empty, are 0. Warns about columns that
+    are no ARKit shapes and no rotations, and are not loaded.
 
     Raises:
         ReenactError: No timecodes, no ARKit columns, one of them twice, or a cell that is not a number.
@@ -52,13 +52,15 @@ def load(path: Path) -> Clip:
     times = _seconds(path, [row[clock] for row in body])
     spellings = [header[index] for index in columns]
     values = table.numbers(path, spellings, [[row[index] for index in columns] for row in body])
-    weights, fps = steady(str(path), times, values)
-    _report_rest(path, header, body, {clock, *columns})
-    return Clip(names, torch.from_numpy(weights.astype(np.float32)), fps)
+    turns = _rotations(path, header, body)
+    made, fps = steady(str(path), times, values if turns is None else np.concatenate([values, turns], axis=1))
+    _report_rest(path, header, {clock, *columns})
+    made = torch.from_numpy(made.astype(np.float32))
+    return Clip(names, made[:, : len(names)].clone(), fps, None if turns is None else made[:, len(names) :].clone())
 
 
 def save(clip: Clip, path: Path) -> None:
-    """Writes a take with eight decimals to a weight and rotations of 0; ARKit shapes that the clip lacks are 0.
+    """Writes a take with eight decimals to a number; rotations and ARKit shapes that the clip lacks are 0.
 
     Frames are counted at 30 per second for clips of 30 frames per second and at 60 otherwise, with fractions where the
     clip's frames fall between. The first is at 0 s or, counting 60, at half a second: a frame number of 30 or more is
@@ -79,13 +81,13 @@ def save(clip: Clip, path: Path) -> None:
     rate, start = (30, 0) if clip.fps == 30 else (60, 30)
     header = ["Timecode", "BlendShapeCount", *(name[0].upper() + name[1:] for name in arkit.NAMES), *ROTATIONS]
     lines = [",".join(header)]
-    rest = ["0.00000000"] * len(ROTATIONS)
-    for frame, row in enumerate(weights):
+    turns = np.zeros((len(clip), 9)) if clip.rotations is None else clip.rotations.detach().cpu().numpy()
+    for frame, row in enumerate(np.concatenate([weights, turns], axis=1)):
         thousandths = round((frame / clip.fps * rate + start) * 1000)
         slots, sub = divmod(thousandths, 1000)
         seconds, slot = divmod(slots, rate)
         clock = f"{seconds // 3600:02}:{seconds // 60 % 60:02}:{seconds % 60:02}:{slot:02}.{sub:03}"
-        lines.append(",".join([clock, "61", *(f"{value:.8f}" for value in row), *rest]))
+        lines.append(",".join([clock, "61", *(f"{value:.8f}" for value in row)]))
     disk.write_bytes(path, ("\n".join(lines) + "\n").encode())
 
 
@@ -108,20 +110,19 @@ def _seconds(path: Path, timecodes: list[str]) -> np.ndarray:
     return times + day * (times < times[0] - day / 2)
 
 
-def _report_rest(path: Path, header: list[str], body: list[list[str]], used: set[int]) -> None:
-    turning, strange = [], []
-    known = {name.lower() for name in ROTATIONS}
-    for index, name in enumerate(header):
-        if index in used or name.lower() == "blendshapecount":
-            continue
-        if name.lower() not in known:
-            strange.append(name)
-        elif any(row[index].strip("-+0. ") for row in body):
-            turning.append(name)
-    if turning:
-        warnings.warn(
-            f"{path}: rotations are not loaded: {', '.join(turning)}; the weights of the blendshapes are", stacklevel=4
-        )
+def _rotations(path: Path, header: list[str], body: list[list[str]]) -> np.ndarray | None:
+    """Rotations (T, 9); None without any such column."""
+    place = {name.lower(): index for index, name in enumerate(header)}
+    found = [place.get(name.lower()) for name in ROTATIONS]
+    if all(index is None for index in found):
+        return None
+    cells = [["0" if index is None else row[index] or "0" for index in found] for row in body]
+    return table.numbers(path, ROTATIONS, cells)
+
+
+def _report_rest(path: Path, header: list[str], used: set[int]) -> None:
+    known = {"blendshapecount", *(name.lower() for name in ROTATIONS)}
+    strange = [name for index, name in enumerate(header) if index not in used and name.lower() not in known]
     if strange:
         warnings.warn(
             f"{path}: columns that are no ARKit shape are not loaded: {', '.join(strange)[:300]}", stacklevel=4
