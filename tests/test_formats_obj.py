@@ -284,7 +284,7 @@ def test_a_library_outside_the_folder_is_left_out_and_said(tmp_path):
 HOSTILE = {
     "no vertices": ("f 1 2 3\n", None, r"neutral\.obj: expected an OBJ file with vertices, got none"),
     "no faces": ("v 0 0 0\n", None, r"neutral\.obj: expected an OBJ file with faces, got none"),
-    "two numbers": (SQUARE.replace("v 0.2 0 0", "v 0.2 0"), None, r"3 or 4 or 6 or 7 numbers in line 2 of v, got '0.2 0'"),
+    "two numbers": (SQUARE.replace("v 0.2 0 0", "v 0.2 0"), None, "numbers in line 2 of v, got .0.2 0."),
     "moved number": ("v 0 0 0\nv 0.2 0\nv 0.2 0.2 0 0\nv 0 0.2 0\nf 1 2 3 4\n", None, "in line 2 of v"),
     "text": (SQUARE.replace("0.2 0 0", "0.2 x 0"), None, "in line 2 of v, got '0.2 x 0'"),
     "comma": (SQUARE.replace("0.2 0 0", "0,2 0 0"), None, "in line 2 of v"),
@@ -301,7 +301,7 @@ HOSTILE = {
     "uv without": (SQUARE.replace("f 1 2 3 4", "f 1/1 2/1 3/1 4/1"), None, r"names a uv outside 1\.\.0"),
     "uv infinite": (SQUARE.replace("f 1 2 3 4", "vt 1e999 0\nf 1/1 2/1 3/1 4/1"), None, "uv hold NaN, infinity"),
     "two corners": (SQUARE.replace("f 1 2 3 4", "f 1 2"), None, "at least 3 corners in face 1, got 'f 1 2'"),
-    "fewer vertices": (None, "v 0 0 0\n", r"smile\.obj: expected the 4 vertices and 1 faces of neutral\.obj, got 1 and 0"),
+    "fewer vertices": (None, "v 0 0 0\n", r"the 4 vertices and 1 faces of neutral\.obj, got 1 and 0"),
     "fewer faces": (None, SMILE + "f 1 2 3\n", "vertices and 1 faces of neutral.obj, got 4 and 2"),
     "other faces": (SQUARE + "f 1 2 3\n", SMILE + "f 2 3 4\n", r"smile\.obj: its faces join other vertices"),
     "shape text": (None, SMILE.replace("0.1", "high"), r"smile\.obj: expected 3 or 4 .* in line 3 of v"),
@@ -335,7 +335,7 @@ def test_a_damaged_line_of_ours_is_a_comment(line, tmp_path):
 
 
 def test_folders_that_are_none_are_refused(tmp_path):
-    with pytest.raises(ReenactError, match="expected a folder of .obj files, found nothing"):
+    with pytest.raises(ReenactError, match=r"expected a folder of \.obj files, found nothing"):
         obj.load(tmp_path / "missing")
     (tmp_path / "empty").mkdir()
     with pytest.raises(ReenactError, match="one neutral and one per shape, got none"):
@@ -343,7 +343,7 @@ def test_folders_that_are_none_are_refused(tmp_path):
     (tmp_path / "empty" / "neutral.obj").write_text(SQUARE)
     with pytest.raises(ReenactError, match=r"expected one \.obj per shape beside neutral\.obj, got none"):
         obj.load(tmp_path / "empty")
-    with pytest.raises(ReenactError, match="expected a folder of .obj files"):
+    with pytest.raises(ReenactError, match=r"expected a folder of \.obj files"):
         obj.load(Path("a\0b"))
 
 
@@ -356,7 +356,7 @@ def test_a_folder_of_too_many_files_is_refused(tmp_path, monkeypatch):
 def test_two_files_of_one_name_are_refused(tmp_path):
     place = folder(tmp_path)
     (place / "smile.OBJ").write_text(SMILE)
-    with pytest.raises(ReenactError, match="two .obj files have the same name"):
+    with pytest.raises(ReenactError, match=r"two \.obj files have the same name"):
         obj.load(place)
 
 

@@ -103,7 +103,7 @@ def _exit(code: int) -> str:
         return f"exit {code}"
 
 
-# The answer: length of the JSON, the JSON, then arrays one after another -----------------------------------------------
+# The answer: length of the JSON, the JSON, then arrays one after another --------------------------------------------
 
 
 def _pack(value: dict[str, Any]) -> bytes:

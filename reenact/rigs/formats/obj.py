@@ -11,6 +11,7 @@ import json
 import re
 import warnings
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -294,7 +295,8 @@ def _slow_table(path: Path, key: str, lines: list[bytes], widths: tuple[int, ...
         if len(words) not in widths or not all(re.fullmatch(_NUMBER, word) for word in words):
             expected = " or ".join(map(str, widths))
             raise ReenactError(
-                f"{path}: expected {expected} numbers in line {number} of {key}, got {line[:60].decode('utf-8', 'replace')!r}"
+                f"{path}: expected {expected} numbers in line {number} of {key}, got "
+                f"{line[:60].decode('utf-8', 'replace')!r}"
             )
         rows.append([float(word) for word in words])
     width = max(each for each in widths if each <= min(map(len, rows)))
@@ -487,7 +489,7 @@ def _bounds(source: _Source, face_object: np.ndarray, count: int) -> list[tuple[
         return None
     # Vertices without a face stay with the object before them.
     edges = [0, *starts[1:], len(source.vertices)]
-    return list(zip(edges[:-1], edges[1:]))
+    return list(pairwise(edges))
 
 
 def _own_parts(rest: Path, source: _Source) -> np.ndarray | None:

@@ -311,6 +311,8 @@ def _stage(rig: Rig, clip: Clip | None, picture: str | None) -> Usd.Stage:
     for name, offsets in zip(rig.names, rig.deltas.detach().cpu().numpy().astype(np.float32)):
         shape = UsdSkel.BlendShape.Define(stage, f"/rig/face/{_identifier(name, taken)}")
         rows = np.flatnonzero(offsets.any(1))
+        if len(rows) == 0:
+            rows = np.zeros(1, np.int64)  # Blender leaves out a shape without any
         shape.CreateOffsetsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(offsets[rows])))
         shape.CreatePointIndicesAttr(Vt.IntArray.FromNumpy(rows.astype(np.int32)))
         targets.append(shape.GetPath())
