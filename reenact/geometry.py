@@ -7,7 +7,7 @@ import inspect
 import numba
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from reenact.errors import ReenactError
@@ -20,6 +20,49 @@ def vertex_normals(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) ->
     sums = torch.zeros_like(vertices).index_add(0, faces.flatten(), face_normals.repeat_interleave(3, dim=0))
     lengths = sums.norm(dim=-1, keepdim=True)
     return torch.where(lengths > 0, sums / lengths.clamp_min(torch.finfo(sums.dtype).tiny), 0)
+
+
+def face_areas(vertices: Float[Tensor, "*batch V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "*batch F"]:
+    """Area of each face, in square units of the vertices."""
+    first, second, third = vertices[..., faces, :].unbind(-2)
+    return torch.linalg.cross(second - first, third - first).norm(dim=-1) / 2
+
+
+def face_frames(vertices: Float[Tensor, "*batch V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "*batch F 3 3"]:
+    """Two edges and the scaled normal of each face, as columns; without area, the normal is 0.
+
+    Source: Sumner & Popović 2004, "Deformation Transfer for Triangle Meshes", doi:10.1145/1015706.1015736, Eqs. 1, 3.
+    """
+    v1, v2, v3 = vertices[..., faces, :].unbind(-2)
+    normal = torch.linalg.cross(v2 - v1, v3 - v1)
+    length = normal.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(vertices.dtype).tiny)
+    # Over the root of its length the normal grows like an edge, so a frame scales as one piece.
+    v4 = v1 + normal / length.sqrt()
+    return torch.stack([v2 - v1, v3 - v1, v4 - v1], dim=-1)
+
+
+def sound_faces(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> Bool[Tensor, "F"]:
+    """Faces with enough area to say how they deform: a millionth of the square of the longest edge or more."""
+    corners = vertices[faces].double()
+    longest = (corners - corners.roll(1, dims=1)).square().sum(-1).amax(1)
+    return face_areas(vertices.double(), faces) > 1e-6 * longest
+
+
+def deformation_gradients(
+    neutral: Float[Tensor, "V 3"], deformed: Float[Tensor, "*batch V 3"], faces: Int[Tensor, "F 3"]
+) -> Float[Tensor, "*batch F 3 3"]:
+    """The matrix that each face of the neutral was turned, stretched and sheared by; identity on faces without area.
+
+    Along the normal a triangle tells nothing: the scaled normal stands in for that direction, so a face that grows by
+    a factor in its plane is taken to grow by it in thickness too.
+
+    Source: Sumner & Popović 2004, Eq. 4: Q = V~ V^-1, with V of the neutral and V~ of the deformed face.
+    """
+    sound = sound_faces(neutral, faces)
+    unit = torch.eye(3, dtype=neutral.dtype, device=neutral.device)
+    frames = torch.where(sound[:, None, None], face_frames(neutral, faces), unit)
+    gradients = face_frames(deformed, faces) @ torch.linalg.inv(frames)
+    return torch.where(sound[:, None, None], gradients, unit)
 
 
 def farthest_points(
