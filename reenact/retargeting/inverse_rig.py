@@ -1,9 +1,10 @@
 """Weights of a rig that come closest to given vertices: bounded least squares, exact and fast.
 
-Chuang & Bregler 2002, "Performance Driven Facial Animation using Blendshape Interpolation", Eq. 4, asks for weights that
-are not negative; an upper bound of 1 is as natural for sculpted shapes. Lawson & Hanson 1974, "Solving Least Squares
-Problems", and Stark & Parker 1995, "Bounded-Variable Least-Squares", give the active-set method. All frames of a clip
-share one Gram matrix, so a frame costs its K projections and one small factorisation, whatever the number of vertices.
+Chuang & Bregler 2002, "Performance Driven Facial Animation using Blendshape Interpolation", Eq. 4, asks for weights
+that are not negative; an upper bound of 1 is as natural for sculpted shapes. Lawson & Hanson 1974, "Solving Least
+Squares Problems", and Stark & Parker 1995, "Bounded-Variable Least-Squares", give the active-set method. All frames of
+a clip share one Gram matrix, so a frame costs its K projections and one small factorisation, whatever the number of
+vertices.
 
 Symbol  Code         Shape
 P       deltas       (K, 3 N) offsets of each shape at N points, as rows
@@ -209,7 +210,8 @@ def _smooth(gram, projections, low, high, smoothness, weights):
 def _solve_one(gram, wanted, low, high, weights):
     """One frame in place: coordinate sweeps until the free set settles, then Stark & Parker's active set."""
     count = len(weights)
-    tolerance = 1e-11 * np.sqrt((wanted * wanted).sum())
+    # Moves of a weight by less than 1e-8 of the largest weights that such a right-hand side asks for are rounding.
+    tolerance = 1e-8 * np.sqrt((wanted * wanted).sum()) / np.diag(gram).max()
     free = np.empty(count, np.bool_)
     for k in range(count):
         weights[k] = min(max(weights[k], low), high)
@@ -272,7 +274,7 @@ def _solve_one(gram, wanted, low, high, weights):
         for k in range(count):
             if not free[k] and not barred[k]:
                 slope = _gradient(gram, wanted, weights, k)
-                pull = -slope if weights[k] <= low else slope
+                pull = (-slope if weights[k] <= low else slope) / gram[k, k]
                 if pull > worst_pull:
                     worst, worst_pull = k, pull
         if worst < 0:

@@ -215,7 +215,7 @@ class ProportionMatching:
         """The clip on the target, weights in [0, 1]."""
         if clip.names != self.source.names:
             raise ReenactError(
-                f"clip: expected the {len(self.source.names)} shapes of {self.source.name}, in its order"
+                f"clip: expected the {len(self.source.names)} shapes of {self.source.name} in its order; see `conform`"
             )
         projections = clip.weights.to(torch.float64) @ self._projection - self.sparsity * self.gram.diagonal()
         weights = nonnegative_least_squares(self.gram, projections, high=1.0)
