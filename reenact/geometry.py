@@ -8,6 +8,7 @@ import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy import sparse
 from torch import Tensor
 
 from reenact.errors import ReenactError
@@ -63,6 +64,42 @@ def deformation_gradients(
     frames = torch.where(sound[:, None, None], face_frames(neutral, faces), unit)
     gradients = face_frames(deformed, faces) @ torch.linalg.inv(frames)
     return torch.where(sound[:, None, None], gradients, unit)
+
+
+def cotangent_laplacian(
+    vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], low: float = -5.0, high: float = 5.0
+) -> sparse.csr_array:
+    """The operator (L x)_i = sum_j w_ij (x_i - x_j), w_ij half the cotangents of the two angles that face an edge.
+
+    Symmetric, rows sum to 0; free of units, since it is not divided by areas. In float64.
+
+    Args:
+        vertices: Where the angles are taken.
+        faces: Triangles.
+        low: Smallest weight of an edge; wide angles make weights negative. Without bounds the operator is positive
+            semidefinite; with an upper one that is certain only where low >= 0.
+        high: Largest weight of an edge, which slivers would make huge.
+
+    Source: Pinkall & Polthier 1993, "Computing Discrete Minimal Surfaces and Their Conjugates"; the bounds are ours.
+    """
+    points = vertices.detach().cpu().to(torch.float64).numpy()
+    corners = faces.detach().cpu().numpy()
+    rows, columns, halves = [], [], []
+    for apex in range(3):
+        tip, left, right = (corners[:, (apex + turn) % 3] for turn in range(3))
+        to_left, to_right = points[left] - points[tip], points[right] - points[tip]
+        cross = np.linalg.norm(np.cross(to_left, to_right), axis=1)
+        squares = (to_left**2).sum(1) + (to_right**2).sum(1)
+        halves.append(0.5 * (to_left * to_right).sum(1) / np.maximum(cross, 1e-12 * squares + 1e-300))
+        rows.append(np.minimum(left, right))
+        columns.append(np.maximum(left, right))
+    count = len(points)
+    shape, ends = (count, count), (np.concatenate(rows), np.concatenate(columns))
+    edges = sparse.coo_array((np.concatenate(halves), ends), shape).tocsr()  # sums what faces share
+    # A weight that cancels to 0 is still an edge, and `low` may raise it; tocsr keeps it.
+    edges.data = edges.data.clip(low, high)
+    edges = edges + edges.T
+    return (sparse.diags_array(edges.sum(axis=1)) - edges).tocsr()
 
 
 def farthest_points(
@@ -174,6 +211,33 @@ def closest_points(
     )
 
 
+def closest_points_around(
+    points: Float[Tensor, "N D"],
+    vertices: Float[Tensor, "V D"],
+    faces: Int[Tensor, "F 3"],
+    candidates: Int[Tensor, "N k"],
+) -> tuple[Int[Tensor, "N"], Float[Tensor, "N 3"]]:
+    """As `closest_points` in a space of any dimension, among the faces that touch the candidate vertices of a point.
+
+    A vertex without faces is passed over; where no candidate has one, the answer is the first face.
+    """
+    corners = np.ascontiguousarray(faces.cpu().numpy())
+    touching = np.argsort(corners.ravel(), kind="stable") // 3
+    starts = np.concatenate([[0], np.cumsum(np.bincount(corners.ravel(), minlength=len(vertices)))])
+    found, shares = _nearest_around(
+        np.ascontiguousarray(points.detach().cpu().double().numpy()),
+        np.ascontiguousarray(vertices.detach().cpu().double().numpy()),
+        corners,
+        np.ascontiguousarray(candidates.cpu().numpy()),
+        touching,
+        starts,
+    )
+    return (
+        torch.from_numpy(found).to(points.device),
+        torch.from_numpy(shares).to(dtype=points.dtype, device=points.device),
+    )
+
+
 _LEAF = 8
 """Faces in a leaf of the tree of boxes."""
 
@@ -254,6 +318,27 @@ def _nearest(points, triangles, order, nodes, node_low, node_high):
 
 
 @_compiled
+def _nearest_around(points, vertices, faces, candidates, touching, starts):
+    found = np.zeros(len(points), np.int64)
+    shares = np.zeros((len(points), 3))
+    for index in range(len(points)):
+        point = points[index]
+        best = np.inf
+        for vertex in candidates[index]:
+            for place in range(starts[vertex], starts[vertex + 1]):
+                face = touching[place]
+                a, b, c = vertices[faces[face, 0]], vertices[faces[face, 1]], vertices[faces[face, 2]]
+                v, w = _closest_in_triangle(point, a, b, c)
+                offset = (1 - v - w) * a + v * b + w * c - point
+                square = _dot(offset, offset)
+                if square < best:
+                    best = square
+                    found[index] = face
+                    shares[index, 0], shares[index, 1], shares[index, 2] = 1 - v - w, v, w
+    return found, shares
+
+
+@_compiled
 def _box_square(point, low, high):
     square = 0.0
     for axis in range(3):
@@ -264,7 +349,7 @@ def _box_square(point, low, high):
 
 @_compiled
 def _closest_in_triangle(p, a, b, c):
-    """Shares of b and c. Source: Ericson 2005, section 5.1.5."""
+    """Shares of b and c, in any dimension. Source: Ericson 2005, section 5.1.5."""
     ab, ac, ap = b - a, c - a, p - a
     d1, d2 = _dot(ab, ap), _dot(ac, ap)
     if d1 <= 0 and d2 <= 0:
@@ -295,4 +380,7 @@ def _closest_in_triangle(p, a, b, c):
 
 @_compiled
 def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    total = 0.0
+    for axis in range(len(a)):
+        total += a[axis] * b[axis]
+    return total

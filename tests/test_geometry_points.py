@@ -4,7 +4,14 @@ import torch
 import trimesh
 
 from reenact.errors import ReenactError
-from reenact.geometry import closest_points, farthest_points, rigid_fit, similarity_fit, vertex_normals
+from reenact.geometry import (
+    closest_points,
+    closest_points_around,
+    farthest_points,
+    rigid_fit,
+    similarity_fit,
+    vertex_normals,
+)
 
 TETRAHEDRON = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=torch.float64)
 OUTSIDE = torch.tensor([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -128,3 +135,20 @@ def test_closest_points_agree_with_trying_every_face():
     assert float((slow - fast).max()) < 0.01  # spacing of the samples
     torch.testing.assert_close(shares.sum(1), torch.ones(200, dtype=torch.float64))
     assert bool((shares >= -1e-12).all())
+
+
+def test_among_the_faces_around_all_vertices_the_closest_point_is_the_closest_of_all():
+    points = random_points(50, 7)
+    every = torch.arange(4).expand(50, 4)
+    found, shares = closest_points_around(points, TETRAHEDRON, OUTSIDE, every)
+    face, expected = closest_points(points, TETRAHEDRON, OUTSIDE)
+    places = [torch.einsum("nc,nci->ni", s, TETRAHEDRON[OUTSIDE[f]]) for f, s in ((found, shares), (face, expected))]
+    torch.testing.assert_close(places[0], places[1])
+
+
+def test_the_closest_point_of_a_triangle_in_five_dimensions():
+    corners = torch.zeros(3, 5, dtype=torch.float64)
+    corners[1, 3] = corners[2, 4] = 1
+    point = torch.tensor([[7.0, -2, 0, 0.25, 0.5]], dtype=torch.float64)
+    _, shares = closest_points_around(point, corners, torch.tensor([[0, 1, 2]]), torch.tensor([[0]]))
+    torch.testing.assert_close(shares[0], torch.tensor([0.25, 0.25, 0.5], dtype=torch.float64))
