@@ -118,7 +118,7 @@ class FrameSolver:
         return self.solve(self.project(displacements))
 
     def step(self, displacements: Float[Tensor, "M 3"], last: Float[Tensor, "K"] | None = None) -> Float[Tensor, "K"]:
-        """Weights of one frame; those of the frame before save time where they are given, and change nothing."""
+        """Weights of one frame; those of the frame before, where given, save time."""
         return self.solve(self.project(displacements)[None], None if last is None else last[None])[0]
 
     def solve(

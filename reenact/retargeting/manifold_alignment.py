@@ -118,7 +118,8 @@ def key_expressions(enhanced: Float[Tensor, "K F"], ensure_coverage: bool = Fals
     padded = torch.nn.functional.pad(enhanced[:, None], (1, 1), mode="replicate")
     smooth = torch.nn.functional.conv1d(padded, (taps / taps.sum())[None, None])[:, 0]
     curve = torch.nn.functional.pad(smooth.sum(0), (1, 1), value=-1.0)  # ends can be peaks, too
-    found = find_peaks(curve.numpy(), plateau_size=1)[0] - 1
+    # Correlation does not change while a lone shape fades in and out; rounding must not make peaks of that plateau.
+    found = find_peaks(curve.round(decimals=9).numpy(), plateau_size=1)[0] - 1
     chosen = set(found.tolist())
     if ensure_coverage:
         chosen.update(enhanced.argmax(1)[enhanced.amax(1) > 0].tolist())
@@ -184,7 +185,9 @@ def solve_alignment(
     theta, left = torch.linalg.eigh(torch.diag(match_weights) + relations)
     stiffness = mesh_weight * laplacian.T @ laplacian
     lam, right = torch.linalg.eigh(stiffness)
-    anchor = 1e-8 * theta.mean().clamp_min(1e-300)
+    anchor = 1e-8 * (theta.mean() + lam.mean())
+    if anchor <= 0:
+        anchor = torch.ones_like(anchor)  # nothing but the guess counts
     wanted = matched + anchor * guess
     wanted = wanted + torch.einsum("mn,kni->kmi", stiffness, guess) + torch.einsum("kl,lmi->kmi", relations, shapes)
     spectrum = torch.einsum("ka,kmi,mb->abi", left, wanted, right)
@@ -371,7 +374,7 @@ class ManifoldAlignment:
         training: Clip | None = None,
         *,
         preset: str = "quantile",
-        markers: int = 200,
+        markers: int = 300,
         sparsity: float | None = None,
         prior: float | None = None,
     ) -> None:

@@ -106,8 +106,7 @@ def surface_distances(rig: Rig, places: Places) -> Float[Tensor, "N N"]:
     pairs, first = np.unique(np.sort(ends, axis=1), axis=0, return_index=True)
     lengths = np.linalg.norm(vertices[ends[first, 0]] - vertices[ends[first, 1]], axis=1)
     graph = coo_array((np.maximum(lengths, 1e-12), (pairs[:, 0], pairs[:, 1])), (len(vertices), len(vertices))).tocsr()
-    size = np.linalg.norm(np.ptp(vertices[nearest], axis=0))
-    return torch.from_numpy(dijkstra(graph, directed=False, indices=nearest, limit=size)[:, nearest])
+    return torch.from_numpy(dijkstra(graph, directed=False, indices=nearest)[:, nearest])
 
 
 def _around_cylinder(points: Float[Tensor, "M 3"]) -> Float[Tensor, "M 2"]:
