@@ -169,7 +169,8 @@ class KernelCCA:
             training: Not used.
             pairs: Examples; see `expression_pairs` for what happens without.
             eta: Regularisation, times the number of pairs. Towards 0 every correlation becomes 1 and means nothing.
-            directions: How many are kept; n - 1 or 15, what is less, where None.
+            directions: How many are kept; all n - 1 where None. Fifteen, as is common for smooth data, lose most of
+                what single shapes say, whose inputs are all at right angles.
             kernel: Of both sides.
 
         Raises:
@@ -186,7 +187,7 @@ class KernelCCA:
         ours, theirs = _centred(self._raw), _centred(self._similarity(outputs, outputs, _width(outputs)))
         smooth = [_smoother(gram, eta * count) for gram in (ours, theirs)]  # K (K + eta n I)^-1
         left, strengths, _ = torch.linalg.svd(smooth[0] @ smooth[1])
-        kept = min(count - 1, 15) if directions is None else directions
+        kept = count - 1 if directions is None else directions
         self.correlations = strengths[:kept]
         """Of the kept directions, largest first."""
         ridge = eta * count * torch.eye(count, dtype=torch.float64)

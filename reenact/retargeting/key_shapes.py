@@ -304,7 +304,8 @@ class KeyShapes:
             target: Is animated.
             correspondence: Makes the target's key shapes, by proportion matching, where none are given; without it
                 they are copied by name.
-            training: Clip of the source in which key shapes are sought; 40 seconds of made-up motion where None.
+            training: Clip of the source in which key shapes are sought; where None, every shape rises and falls once,
+                as in the range-of-motion takes of actors.
             config: Settings.
             features: Tracked places of the source; spread over what moves where None.
             target_keys: An artist's key shapes for each region, as weights (K, Kt) or as meshes (K, V, 3). Which
@@ -316,7 +317,7 @@ class KeyShapes:
         self.source, self.target = source, target
         self.config = config or KeyShapesConfig()
         if training is None:
-            training = motion.synthesize(source.names, 40.0, self.config.seed, kind="mixed")
+            training = motion.synthesize(source.names, 2.0 * len(source.names), self.config.seed, kind="ramps")
         check_names(training, source)
         if len(training) < 2:
             raise ReenactError(f"training clip: expected at least two frames, got {len(training)}")

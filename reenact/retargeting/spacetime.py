@@ -42,7 +42,7 @@ class VelocityMatching:
         training: Clip | None = None,
         *,
         holding: float = 1e3,
-        prior: float = 1e-3,
+        prior: float = 1e-7,
         linearised: bool = False,
     ) -> None:
         """
@@ -53,7 +53,8 @@ class VelocityMatching:
             training: Not used.
             holding: kappa_b and kappa_e, how firmly keys are held, in units of the mean of H's diagonal.
             prior: kappa_p, strength of the PCA prior, with the traces of H and Q made equal. It is centred on the
-                neutral, where the published one is centred on the mean shape, so that a still face stays still.
+                neutral, where the published one is centred on the mean shape, so that a still face stays still. Slow
+                motion has hardly any velocity to hold against it: 1e-3 already erases a held expression.
             linearised: See `carry_shapes`.
 
         Raises:
