@@ -48,9 +48,9 @@ _CHUNK = 8  # expressions at a time: bounds memory, not results
 class DeformationTransfer:
     """Transfers the source's deformation gradients; one factorisation and one solve for all of its shapes.
 
-    The solve is linear in the gradients, and these are linear in the weights but along the normal, the direction that a
-    face does not know and where Sumner & Popović take the scaled normal. So the source's shapes are transferred once, at
-    full strength, and a clip combines them. That is what `transfer` does to each frame where partner faces lie in
+    The solve is linear in the gradients, and these are linear in the weights but along the normal, the direction that
+    a face does not know and where Sumner & Popović take the scaled normal. So the source's shapes are transferred once,
+    at full strength, and a clip combines them. That is what `transfer` does to each frame where partner faces lie in
     parallel planes; between heads of different proportions the two differ by 2 to 3 % of the motion.
     """
 
@@ -349,11 +349,11 @@ def _nearest_along(rig: Rig, paired: ndarray, reach: float) -> tuple[ndarray, nd
     lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) + 1e-12
     graph = coo_array((lengths, (edges[:, 0], edges[:, 1])), shape=(len(points),) * 2).tocsr()
     distance, _, origin = dijkstra(graph, directed=False, indices=paired, return_predecessors=True, min_only=True)
-    rank = np.zeros(len(points) + 1, int)
+    rank = np.zeros(len(points), int)
     rank[paired] = np.arange(len(paired))
     limit = reach * np.ptp(points[:, 1])
     fade = np.clip(2 - distance / limit, 0, 1) if limit > 0 else (distance == 0).astype(float)
-    return rank[origin], fade
+    return rank[np.where(np.isfinite(distance), origin, paired[0])], fade
 
 
 def face_pairs(source: Rig, target: Rig, followed: csr_array) -> csr_array:
@@ -424,9 +424,9 @@ def transfer_correspondence(
         a right angle apart.
 
     Source: Sumner & Popović 2004, Sec. 4, Eqs. 9 to 12. Their weights depend on the size of the meshes, which they do
-    not tell: we scale the target's box to a diagonal of 1. Ours too: markers hold to about a millionth, not exactly; the
-    source starts from the similarity that brings them closest; pieces without markers keep their place at first; and a
-    vertex whose closest point faces away is left free, where the paper searches on for one that does not.
+    not tell: we scale the target's box to a diagonal of 1. Ours too: markers hold to about a millionth, not exactly;
+    the source starts from the similarity that brings them closest; pieces without markers keep their place at first;
+    and a vertex whose closest point faces away is left free, where the paper searches on for one that does not.
     """
     config = config or CorrespondenceConfig()
     _check_belongs(source, target, markers)

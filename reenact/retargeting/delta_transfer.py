@@ -1,7 +1,7 @@
 """Delta transfer: every vertex of the target moves by its partner's offset, scaled and turned.
 
-Noh & Neumann 2001, "Expression Cloning", doi:10.1145/383259.383290, reduced to its plainest form, with one scale for the
-whole head unless asked otherwise. The baseline of mesh methods: fast, and blind to how the surface stretches.
+Noh & Neumann 2001, "Expression Cloning", doi:10.1145/383259.383290, reduced to its plainest form, with one scale for
+the whole head unless asked otherwise. The baseline of mesh methods: fast, and blind to how the surface stretches.
 
 Symbol     Code          Shape
 S_i - S    deltas        (Ks, Vs, 3)
