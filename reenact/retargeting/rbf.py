@@ -24,6 +24,7 @@ from reenact.errors import ReenactError
 from reenact.geometry import similarity_fit
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.inverse_rig import nonnegative_least_squares
+from reenact.retargeting.trivial import check_names
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
@@ -213,10 +214,7 @@ class ProportionMatching:
 
     def __call__(self, clip: Clip) -> Clip:
         """The clip on the target, weights in [0, 1]."""
-        if clip.names != self.source.names:
-            raise ReenactError(
-                f"clip: expected the {len(self.source.names)} shapes of {self.source.name} in its order; see `conform`"
-            )
+        check_names(clip, self.source)
         projections = clip.weights.to(torch.float64) @ self._projection - self.sparsity * self.gram.diagonal()
         weights = nonnegative_least_squares(self.gram, projections, high=1.0)
         return Clip(self.target.names, weights.float(), clip.fps)
