@@ -51,8 +51,9 @@ def nonnegative_least_squares(
         low: Smallest weight; -inf for plain least squares.
         high: Largest weight.
         start: Weights to start each frame from, instead of those of the frame before; changes the time, not the result.
-        ridge: Share of the mean of H's diagonal that is added to it. Among weights that fit alike it prefers small
-            ones; a second solve pulls towards the first instead of to 0, so that it biases nothing else.
+        ridge: Share of the mean of H's diagonal that is added to it where H is not definite by as much. Among weights
+            that fit alike it prefers small ones; a second solve pulls towards the first instead of to 0, so that it
+            biases nothing else.
         smoothness: Weight of the squared change between frames, in the units of H; 0 makes frames independent. The
             optimum is then joint, over the whole clip.
 
@@ -64,17 +65,29 @@ def nonnegative_least_squares(
     wanted = np.ascontiguousarray(projections.detach().cpu().to(torch.float64).numpy())
     if not (np.isfinite(matrix).all() and np.isfinite(wanted).all()):
         raise ReenactError("least squares: expected finite numbers, got NaN or infinity")
-    # A tiny constant keeps shapes that move nothing solvable: they get 0, or the bound that is nearest to 0.
-    extra = ridge * np.trace(matrix) / max(len(matrix), 1) + 1e-300
-    matrix = np.ascontiguousarray((matrix + matrix.T) / 2 + extra * np.eye(len(matrix)))
+    matrix = (matrix + matrix.T) / 2
+    extra = ridge * float(np.trace(matrix)) / max(len(matrix), 1)
+    if _definite(matrix, extra):
+        extra = 0.0  # one solution, well told apart
+    # The tiny constant keeps shapes that move nothing solvable: they get 0, or the bound that is nearest to 0.
+    matrix = np.ascontiguousarray(matrix + (extra + 1e-300) * np.eye(len(matrix)))
     rest = min(max(0.0, low), high)
     weights = np.full(wanted.shape, rest) if start is None else start.detach().cpu().to(torch.float64).numpy().copy()
     _solve(matrix, wanted, low, high, weights, start is None)
-    if ridge > 0:
+    if extra > 0:
         _solve(matrix, wanted + extra * weights, low, high, weights, False)
     if smoothness > 0 and len(weights) > 1:
         _smooth(matrix, wanted + extra * weights, low, high, smoothness, weights)
     return torch.from_numpy(weights)
+
+
+def _definite(matrix: np.ndarray, margin: float) -> bool:
+    """Whether the smallest eigenvalue exceeds the margin."""
+    try:
+        np.linalg.cholesky(matrix - margin * np.eye(len(matrix)))
+    except np.linalg.LinAlgError:
+        return False
+    return bool(margin > 0)
 
 
 class InverseRig:
@@ -208,7 +221,7 @@ def _smooth(gram, projections, low, high, smoothness, weights):
 
 @_compiled
 def _solve_one(gram, wanted, low, high, weights):
-    """One frame in place: coordinate sweeps until the free set settles, then Stark & Parker's active set."""
+    """One frame in place: a few coordinate sweeps to guess the free set, then Stark & Parker's active set."""
     count = len(weights)
     # Moves of a weight by less than 1e-8 of the largest weights that such a right-hand side asks for are rounding.
     tolerance = 1e-8 * np.sqrt((wanted * wanted).sum()) / np.diag(gram).max()
@@ -216,7 +229,7 @@ def _solve_one(gram, wanted, low, high, weights):
     for k in range(count):
         weights[k] = min(max(weights[k], low), high)
     gradient = gram @ weights - wanted
-    for sweep in range(30):
+    for sweep in range(4):
         settled = sweep > 1
         for k in range(count):
             value = min(max(weights[k] - gradient[k] / gram[k, k], low), high)
@@ -233,6 +246,8 @@ def _solve_one(gram, wanted, low, high, weights):
     factor = np.empty((count, count))
     chosen = np.empty(count, np.int64)
     step = np.empty(count)
+    pulls = np.empty(count)
+    fewest = count + 1
     barred = np.zeros(count, np.bool_)  # freed, and found unable to move: rounding
     for _ in range(20 * count + 20):
         # Move to the minimum over the free weights, as far as the bounds allow; what meets a bound stays there.
@@ -259,6 +274,15 @@ def _solve_one(gram, wanted, low, high, weights):
                     continue
                 if reach < share:
                     share, blocking = reach, row
+            if blocking >= 0 and _clipped_falls(gram, wanted, weights, chosen, size, step, low, high):
+                # All that would pass a bound stop there at once: still downhill, and many rounds fewer.
+                for row in range(size):
+                    k = chosen[row]
+                    end = weights[k] + step[row]
+                    weights[k] = min(max(end, low), high)
+                    free[k] = low <= end <= high
+                barred[:] = False
+                continue
             for row in range(size):
                 k = chosen[row]
                 weights[k] = min(max(weights[k] + share * step[row], low), high)
@@ -269,17 +293,42 @@ def _solve_one(gram, wanted, low, high, weights):
             k = chosen[blocking]
             weights[k] = low if step[blocking] < 0 else high
             free[k], barred[k] = False, share <= 0
-        # Free the weight whose bound holds it back most.
-        worst, worst_pull = -1, tolerance
+        # Free what its bound holds back: all of it while that keeps getting less, then one at a time, which must end.
+        held, worst, worst_pull = 0, -1, tolerance
         for k in range(count):
+            pulls[k] = 0.0
             if not free[k] and not barred[k]:
                 slope = _gradient(gram, wanted, weights, k)
-                pull = (-slope if weights[k] <= low else slope) / gram[k, k]
-                if pull > worst_pull:
-                    worst, worst_pull = k, pull
+                pulls[k] = (-slope if weights[k] <= low else slope) / gram[k, k]
+                if pulls[k] > tolerance:
+                    held += 1
+                if pulls[k] > worst_pull:
+                    worst, worst_pull = k, pulls[k]
         if worst < 0:
             break
+        if held < fewest:
+            fewest = held
+            for k in range(count):
+                free[k] = free[k] or pulls[k] > tolerance
         free[worst] = True
+
+
+@_compiled
+def _clipped_falls(gram, wanted, weights, chosen, size, step, low, high):
+    """Whether the whole step, each weight stopped at its bounds, lowers the objective."""
+    change = np.zeros(len(weights))
+    for row in range(size):
+        k = chosen[row]
+        change[k] = min(max(weights[k] + step[row], low), high) - weights[k]
+    fall = 0.0
+    for row in range(size):
+        k = chosen[row]
+        if change[k] != 0.0:
+            slope = _gradient(gram, wanted, weights, k)
+            for j in range(len(weights)):
+                slope += 0.5 * gram[k, j] * change[j]
+            fall += change[k] * slope
+    return fall < 0
 
 
 @_compiled
