@@ -156,8 +156,8 @@ def kept(sweep: Sweep, allowed: float) -> float:
 
 def draw(target: Rig, sweeps: dict[str, Sweep], allowed: float, truth: Tensor) -> plt.Figure:
     figure = plt.figure(figsize=(14, 7))
-    grid = figure.add_gridspec(2, 6)
-    left, right = figure.add_subplot(grid[0, :3]), figure.add_subplot(grid[0, 3:])
+    grid = figure.add_gridspec(2, 10)
+    left, right = figure.add_subplot(grid[0, :5]), figure.add_subplot(grid[0, 5:])
     for name, sweep in sweeps.items():
         left.plot(sweep.folds, 100 * sweep.motion, "-", color=COLOURS[name], label=name)
         right.plot(sweep.folds, sweep.error, "-", color=COLOURS[name], label=name)
@@ -185,7 +185,7 @@ def draw(target: Rig, sweeps: dict[str, Sweep], allowed: float, truth: Tensor) -
         else:
             pictures[f"{name}, folds gone,\n{100 * sweep.motion[at]:.0f} % of all motion"] = sweep.weights[at][worst]
     for place, (title, weights) in enumerate(pictures.items()):
-        axis = figure.add_subplot(grid[1, place])
+        axis = figure.add_subplot(grid[1, 2 * place : 2 * place + 2])
         picture = portrait.render(target.vertices(weights[None]), 256, ("color",))["color"][0]
         axis.imshow(picture.movedim(0, -1))
         axis.set_title(title, fontsize=9)

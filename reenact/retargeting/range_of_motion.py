@@ -46,6 +46,9 @@ class RangeConfig:
     """The same for markers that hardly move, as a share of the shape's largest displacement."""
     noise: float = 0.03
     """Noise of a marker, as a share of the median shape's largest displacement."""
+    misfit: float = 4.0
+    """How much what stays unexplained at a marker adds to its noise: an actor who does what no mix of the rig's shapes
+    does must not teach them."""
     sparsity: float = 0.002
     """What a weight loses by the penalty on activity."""
     agreement: float = 0.9
@@ -105,7 +108,8 @@ def _learn(
     largest = squares.max(1, keepdims=True)
     support = squares > 0.01 * largest
     prior = config.spread**2 * (squares + config.elsewhere**2 * largest) / 3  # variance of a coordinate of e_k^m
-    noise = config.noise**2 * np.median(largest)
+    least = config.noise**2 * np.median(largest)
+    noise = np.full(guess.shape[1], least)  # (M,) variance of a coordinate
     shapes, variance, amplitudes = guess.copy(), prior.copy(), np.ones(len(guess))
     covered = np.zeros(len(guess), dtype=np.int64)
 
@@ -113,6 +117,11 @@ def _learn(
         certainty = 1 / (noise + weights**2 @ variance)  # (N, M)
         fitted, similarity = weights.copy(), np.zeros_like(weights)
         _fit(shapes, displacements, certainty, config.sparsity, support, fitted, similarity)
+        # What neither the shapes nor their uncertainty explain is no error of any one shape.
+        rest = (displacements - np.einsum("nk,kmi->nmi", fitted, shapes)) ** 2
+        unexplained = (rest.sum(2) / 3 - fitted**2 @ variance).clip(min=0).mean(0)
+        noise[:] = np.maximum(least, config.misfit * unexplained)
+        certainty = 1 / (noise + fitted**2 @ variance)
         return fitted, similarity, certainty
 
     for _ in range(2):  # the second time the uncertainty has the right size
