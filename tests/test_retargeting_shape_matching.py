@@ -57,9 +57,8 @@ def test_pairs_that_are_a_little_off_still_find_the_partners(toy_rig, shuffled):
 
 def test_a_merged_shape_has_no_single_partner():
     left, right, other = torch.eye(3, dtype=torch.float64)
-    config = ShapeMatchingConfig()
-    assert find_partners(torch.stack([left, right, other]), torch.stack([left + right, other]), config) == ((2, 1),)
-    assert find_partners(torch.stack([left + right, other]), torch.stack([left, right, other]), config) == ((1, 2),)
+    assert find_partners(torch.stack([left, right, other]), torch.stack([left + right, other]), 0.6, 0.1) == ((2, 1),)
+    assert find_partners(torch.stack([left + right, other]), torch.stack([left, right, other]), 0.6, 0.1) == ((1, 2),)
 
 
 def test_each_shape_has_one_partner_at_most_and_only_one_that_is_alike():
@@ -67,7 +66,7 @@ def test_each_shape_has_one_partner_at_most_and_only_one_that_is_alike():
     ours, theirs = (torch.randn(12, 40, dtype=torch.float64, generator=generator) for _ in range(2))
     theirs[:5] = ours[:5] + 0.3 * theirs[:5]
     theirs[5] = ours[4] + 0.5 * theirs[5]  # a second claim
-    pairs = find_partners(ours, theirs, ShapeMatchingConfig())
+    pairs = find_partners(ours, theirs, 0.6, 0.1)
     assert pairs == tuple((k, k) for k in range(5))
 
 

@@ -35,16 +35,19 @@ from reenact.rigs.rig import Rig
 class ShapeMatchingConfig:
     """When two shapes are one."""
 
-    similarity: float = 0.6
-    """Least cosine between the motions of partners."""
+    similarity: float = 0.3
+    """Least cosine between the motions of partners. Low, because each row of an assignment takes part: what is left for
+    a shape when the sure pairs are made is mostly right, and worth more than the carried guess where that is poor."""
     sum_gain: float = 0.1
     """A shape that looks this much more like the sum of two shapes than like either has no single partner."""
-    share: float = 0.5
-    """Least share of the shapes of the rig with fewer that must pair off for ranges to be believed equal."""
-    blur: float = 0.025
+    sure: float = 0.6
+    """Cosine from which a pair counts for `share`."""
+    share: float = 0.55
+    """Least share of the shapes of the rig with fewer that must surely pair off for ranges to be believed equal."""
+    blur: float = 0.05
     """Width over which motion is averaged before it is compared, as a share of the spread of the places; what pairs of
     places get wrong by less then matters less."""
-    stiffness: float = 0.1
+    stiffness: float = 1.0
     """Of the thin-plate map, see `carry_shapes`."""
 
 
@@ -77,9 +80,10 @@ class ShapeMatching:
         config = config or ShapeMatchingConfig()
         self.carried = carry_shapes(source, target, correspondence, stiffness=config.stiffness)
         ours, theirs = self.carried.source_shapes, self.carried.guess
-        found = find_partners(*self._compared(config), config)
-        believed = len(found) >= config.share * min(len(source.names), len(target.names))
-        self.partners: tuple[tuple[int, int], ...] = found if believed else ()
+        compared = self._compared(config)
+        sure = find_partners(*compared, config.sure, config.sum_gain)
+        believed = len(sure) >= config.share * min(len(source.names), len(target.names))
+        self.partners = find_partners(*compared, config.similarity, config.sum_gain) if believed else ()
         """Source shape and target shape of each pair; none where too few pair off."""
         personal = theirs.clone()
         for j, k in self.partners:
@@ -109,16 +113,16 @@ class ShapeMatching:
 
 
 def find_partners(
-    ours: Float[Tensor, "Ks D"], theirs: Float[Tensor, "Kt D"], config: ShapeMatchingConfig
+    ours: Float[Tensor, "Ks D"], theirs: Float[Tensor, "Kt D"], similarity: float, sum_gain: float
 ) -> tuple[tuple[int, int], ...]:
-    """Pairs of rows with the largest sum of cosines, each row in one at most, each cosine large enough.
+    """Pairs of rows with the largest sum of cosines, each row in one at most, each cosine at least `similarity`.
 
-    Left out are rows that are a sum of two of the other side: merged left and right, or a viseme.
+    Left out are rows that are a sum of two of the other side, better by `sum_gain`: merged left and right, or a viseme.
     """
     cosines = _unit(ours) @ _unit(theirs).T
-    single = _best_sum(theirs, ours) - cosines.amax(0) < config.sum_gain  # (Kt,)
-    single_ours = _best_sum(ours, theirs) - cosines.amax(1) < config.sum_gain  # (Ks,)
-    allowed = single_ours[:, None] & single & (cosines >= config.similarity)
+    single = _best_sum(theirs, ours) - cosines.amax(0) < sum_gain  # (Kt,)
+    single_ours = _best_sum(ours, theirs) - cosines.amax(1) < sum_gain  # (Ks,)
+    allowed = single_ours[:, None] & single & (cosines >= similarity)
     rows, columns = linear_sum_assignment(torch.where(allowed, cosines, 0).numpy(), maximize=True)
     return tuple((int(j), int(k)) for j, k in zip(rows, columns) if allowed[j, k])
 
