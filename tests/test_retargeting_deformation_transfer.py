@@ -13,6 +13,7 @@ from reenact.retargeting.correspondence import Correspondence, Places
 from reenact.retargeting.deformation_transfer import (
     DeformationTransfer,
     GradientSolver,
+    densify,
     face_pairs,
     transfer_correspondence,
     vertex_pairs,
@@ -165,14 +166,27 @@ def test_confidence_blends_towards_stiffness(toy_pair):
     torch.testing.assert_close(blended, 0.25 * sure, rtol=0, atol=1e-6)
 
 
-def test_what_no_pair_reaches_keeps_its_shape(toy_pair):
+def test_pairs_speak_up_to_their_reach_and_fade_to_its_double(toy_pair):
     source, target = toy_pair
     front = (source.neutral[:, 2] > 0).nonzero().flatten()
-    method = DeformationTransfer(source, target, Correspondence.identity(source, target)[front])
-    back = target.neutral[:, 2] < -0.03
-    largest = method.shapes.deltas.norm(dim=-1)
-    assert float(largest[:, back].max()) < 0.02 * float(largest.max())
-    assert relative(method.shapes.deltas, transfer(source, target).shapes.deltas) < 0.05
+    followed = vertex_pairs(source, target, Correspondence.identity(source, target)[front], reach=0.1).sum(1)
+    behind = -target.neutral[:, 2].numpy()  # metres behind the last pairs; the egg is 25 cm tall, edges 14 mm long
+    np.testing.assert_allclose(followed[behind < 0], 1)
+    assert followed[behind > 0.05].max() == 0  # twice 25 mm, at most straight back
+    between = followed[(behind > 0.03) & (behind < 0.04)]
+    assert between.min() >= 0
+    assert between.max() < 1
+
+
+def test_half_a_correspondence_is_completed(toy_pair):
+    source, target = toy_pair
+    pairs = Correspondence.identity(source, target)
+    assert densify(source, target, pairs) is pairs
+    front = pairs[(source.neutral[:, 2] > 0).nonzero().flatten()]
+    whole = densify(source, target, front)
+    assert torch.equal(whole.source.corners[: len(front)], front.source.corners)
+    shapes = DeformationTransfer(source, target, front).shapes.deltas
+    assert relative(shapes, transfer(source, target).shapes.deltas) < 0.05
 
 
 def test_a_vertex_takes_after_the_paired_one_nearest_along_the_surface_and_never_after_another_piece():
@@ -236,7 +250,13 @@ def test_a_piece_without_partners_moves_as_the_targets_own_shapes_would():
     ball = make_toy_rig("ball")
     pairs = Correspondence.identity(source, target)[torch.arange(len(ball.neutral))]
     shapes = DeformationTransfer(source, target, pairs).shapes.deltas
-    torch.testing.assert_close(shapes[:, len(ball.neutral) :], target.deltas[:, len(ball.neutral) :], rtol=0, atol=1e-5)
+    # The pieces rest in doubt: of two shapes that move 642 vertices of the ball and as many of a loose piece, the fit
+    # takes c / (c + 0.025 l) with c and l the squared motion of both. Others of the ball help a little.
+    for shape, piece in ((0, slice(642, 1284)), (3, slice(1284, 1926))):
+        c, lost = (target.deltas[shape, part].square().sum() for part in (slice(642), slice(642, 1926)))
+        expected = c / (c + 0.025 * lost) * target.deltas[shape, piece]
+        assert relative(shapes[shape, piece], expected) < 0.1
+    assert float(shapes[[1, 2, 4, 5, 6], len(ball.neutral) :].norm(dim=-1).max()) < 1e-3
 
 
 def test_faces_without_area_do_no_harm(toy_pair):

@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import coo_array, csr_array, diags_array, sparray
 from scipy.sparse.csgraph import connected_components, dijkstra
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -33,6 +33,7 @@ from reenact.geometry import (
     deformation_gradients,
     face_areas,
     face_frames,
+    farthest_points,
     similarity_fit,
     sound_faces,
     vertex_normals,
@@ -68,7 +69,7 @@ class DeformationTransfer:
         Args:
             source: Where motion comes from.
             target: Where it goes to.
-            correspondence: Dense pairs, about one for each vertex; fewer count as markers of `transfer_correspondence`.
+            correspondence: Pairs, best one for each vertex; where there are none, see `densify`.
             training: Not used.
             weighting: `faces` weights all faces alike, as Sumner & Popović do; `areas` makes the result independent of
                 how finely a surface is cut into faces.
@@ -93,19 +94,21 @@ class DeformationTransfer:
         )
         self._carried = float(scale) * followed  # source offsets -> what plain delta transfer would make of them
         self._anchors = Anchors(target, self.solver.pieces, self._carry(source.deltas.double()))
-        self._completion = Completion(target, self.solver.pieces, followed.sum(1))
-        offsets = self._completion(self._transfer(source.vertices(torch.eye(len(source.names))).double()))
+        self.covered = torch.from_numpy(followed.sum(1))
+        """How far each vertex of the target follows the source, (Vt,) in [0, 1]."""
+        self._explanation = Explanation(target, self.solver.pieces, followed.sum(1))
+        offsets = self._transfer(source.vertices(torch.eye(len(source.names))).double())
+        self._projection = self._explanation.projections(offsets)  # (Ks, Kt)
+        offsets = self._explanation.complete(offsets)
         self.shapes = Rig(
             f"{source.name} on {target.name}", target.neutral, offsets.float(), source.names, target.faces
         )
         """The source's shapes on the target's mesh."""
-        self._inverse = InverseRig(target)
-        self._projection = self._inverse.projections(target.neutral.double() + offsets)  # (Ks, Kt)
 
     def __call__(self, clip: Clip) -> Clip:
         """The clip on the target: bounded least squares of `vertices(clip)`, weights in [0, 1]."""
         check_names(self.source, clip)
-        weights = nonnegative_least_squares(self._inverse.gram, clip.weights.double() @ self._projection, high=1.0)
+        weights = self._explanation.weights(clip.weights.double() @ self._projection)
         return Clip(self.target.names, weights.float(), clip.fps)
 
     def vertices(self, clip: Clip) -> Float[Tensor, "T V 3"]:
@@ -116,13 +119,13 @@ class DeformationTransfer:
     def transfer(self, vertices: Float[Tensor, "T Vs 3"]) -> Float[Tensor, "T Vt 3"]:
         """Target vertices for any meshes of the source's topology: the method to the letter, a solve for each.
 
-        Source: Sumner & Popović 2004, Eqs. 6 to 8.
+        Source: Sumner & Popović 2004, the section on deformation transfer.
         """
         if vertices.shape[1] != len(self.source.neutral):
             raise ReenactError(
                 f"{self.source.name}: expected {len(self.source.neutral)} vertices a frame, got {vertices.shape[1]}"
             )
-        moved = self.target.neutral.double() + self._completion(self._transfer(vertices.double()))
+        moved = self.target.neutral.double() + self._explanation.complete(self._transfer(vertices.double()))
         return moved.to(vertices.dtype)
 
     def gradients(self, vertices: Float[Tensor, "T Vs 3"]) -> Float[Tensor, "T Ft 3 3"]:
@@ -165,8 +168,8 @@ class GradientSolver:
     Faces that share no edge are not tied to each other: each connected piece may still be moved as a whole, and is
     returned with its first vertex at rest.
 
-    Source: Sumner & Popović 2004, Eqs. 7 and 8. Their fourth vertex of a face occurs in that face only; it always meets
-    the gradient along the normal exactly, so what is left is the gradient in the plane of the face.
+    Source: Sumner & Popović 2004, the system A^T A x = A^T c. Their fourth vertex of a face occurs in that face only;
+    it always meets the gradient along the normal exactly, so what is left is the gradient in the plane of the face.
     """
 
     def __init__(self, rig: Rig, importance: Float[ndarray, "F"]) -> None:
@@ -189,9 +192,8 @@ class GradientSolver:
         self.pieces = connected_pieces(faces, count)
         _, first = np.unique(self.pieces, return_index=True)
         self._free = np.setdiff1d(np.arange(count), first)
-        normal = (self._weighted @ operator).tocsr()[self._free][:, self._free].tocsc()
-        # Symmetric and positive definite, so no pivoting: the order that keeps the factors sparse is the order taken.
-        self._factor = splu(normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        normal = (self._weighted @ operator).tocsr()[self._free][:, self._free]
+        self._factor = _factored(normal)
 
     def __call__(self, gradients: Float[Tensor, "T F 3 3"]) -> Float[Tensor, "T V 3"]:
         """Offsets from the neutral for gradients less the identity, float64."""
@@ -260,13 +262,17 @@ class Anchors:
         return offsets
 
 
-class Completion:
-    """Moves the pieces that have no partner on the source (often teeth, tongue, eyes) as the target's own shapes would.
+class Explanation:
+    """Weights of the target's shapes for transferred vertices, and what these say of pieces without partners.
 
-    Its shapes are fitted to the rest of the face, between 0 and 1, and taken at their word for these pieces.
+    Pieces that have no partner on the source (often teeth, tongue, eyes) move as the target's own shapes do. In doubt
+    they rest: a shape that moves little else, like a glance, needs good reason.
 
-    Source: ours.
+    Source: ours, but for the bounded least squares.
     """
+
+    _REST = 0.05
+    """Mean squared motion of the pieces without partner, against mean squared error on the rest."""
 
     def __init__(self, rig: Rig, pieces: ndarray, covered: Float[ndarray, "V"]) -> None:
         """
@@ -275,18 +281,26 @@ class Completion:
             pieces: Piece of each vertex.
             covered: How far each vertex follows the source, in [0, 1].
         """
-        share = np.bincount(pieces, covered) / np.bincount(pieces)
-        self._lost = np.flatnonzero(share[pieces] < 0.1)
-        self._rig = rig
-        self._inverse = InverseRig(rig, importance=torch.from_numpy(covered)) if len(self._lost) else None
+        lost = (np.bincount(pieces, covered) / np.bincount(pieces) < 0.1)[pieces]
+        rest = self._REST * covered.sum() / max(lost.sum(), 1)
+        self._rig, self._lost = rig, torch.from_numpy(np.flatnonzero(lost))
+        self._inverse = InverseRig(rig, importance=torch.from_numpy(np.where(lost, rest, covered)))
 
-    def __call__(self, offsets: Float[Tensor, "T V 3"]) -> Float[Tensor, "T V 3"]:
-        """The offsets with the lost pieces filled in."""
-        if self._inverse is None or len(offsets) == 0:
-            return offsets
-        projections = self._inverse.projections(self._rig.neutral.double() + offsets)
-        weights = nonnegative_least_squares(self._inverse.gram, projections, high=1.0)
+    def projections(self, offsets: Float[Tensor, "T V 3"]) -> Float[Tensor, "T K"]:
+        """What the target's shapes have in common with the offsets; see `weights`."""
         offsets = offsets.clone()
+        offsets[:, self._lost] = 0
+        return self._inverse.projections(self._rig.neutral.double() + offsets)
+
+    def weights(self, projections: Float[Tensor, "T K"]) -> Float[Tensor, "T K"]:
+        """Bounded least squares, in [0, 1]."""
+        return nonnegative_least_squares(self._inverse.gram, projections, high=1.0)
+
+    def complete(self, offsets: Float[Tensor, "T V 3"]) -> Float[Tensor, "T V 3"]:
+        """The offsets with the pieces without partners filled in."""
+        if len(self._lost) == 0:
+            return offsets
+        offsets, weights = offsets.clone(), self.weights(self.projections(offsets))
         offsets[:, self._lost] = torch.einsum("tk,kvc->tvc", weights, self._rig.deltas[:, self._lost].double())
         return offsets
 
@@ -391,12 +405,47 @@ def face_pairs(source: Rig, target: Rig, followed: csr_array) -> csr_array:
 
 
 def densify(source: Rig, target: Rig, correspondence: Correspondence | None) -> Correspondence:
-    """The correspondence itself if it covers the target, else what `transfer_correspondence` makes of its markers."""
+    """The correspondence itself if it covers the target; else with pairs added where it has none.
+
+    Gradients must be known between what moves and what rests, or the face drifts. Where a tenth of the target's
+    vertices or more is not close to a pair, 300 pairs, the surest first, serve as markers of `transfer_correspondence`,
+    whose pairs fill the gaps on both rigs. Connected pieces without any given pair stay without, and do not count: an
+    eyeball has no partner in a lid.
+
+    Raises:
+        ReenactError: There is no correspondence, or it belongs to other rigs.
+    """
     if correspondence is None:
         raise ReenactError(f"{source.name} to {target.name}: expected a correspondence, got none; let it be found")
     _check_belongs(source, target, correspondence)
-    few = len(correspondence) < min(1000, len(target.neutral) // 4)
-    return transfer_correspondence(source, target, correspondence) if few else correspondence
+    source_gaps, _ = _gaps(source, correspondence.source)
+    target_gaps, pieces = _gaps(target, correspondence.target)
+    if target_gaps.sum() < 0.1 * pieces.sum():
+        return correspondence
+    count = min(300, int((correspondence.confidence > 0).sum()))
+    places = correspondence.source.of(source.neutral)
+    markers = correspondence[farthest_points(places, count, correspondence.confidence)]
+    dense = transfer_correspondence(source, target, markers)
+    fills = source_gaps[dense.source.corners.numpy()].all(1) | target_gaps[dense.target.corners.numpy()].all(1)
+    added = torch.from_numpy(np.flatnonzero(fills))
+    return Correspondence(
+        _joined(correspondence.source, dense.source[added]),
+        _joined(correspondence.target, dense.target[added]),
+        torch.cat([correspondence.confidence, dense.confidence[added]]),
+    )
+
+
+def _joined(first: Places, second: Places) -> Places:
+    return Places(torch.cat([first.corners, second.corners]), torch.cat([first.shares, second.shares]))
+
+
+def _gaps(rig: Rig, places: Places) -> tuple[ndarray, ndarray]:
+    """Vertices that are not close to any place along the surface, and vertices of pieces that hold a place."""
+    paired = np.unique(places.corners.numpy()[places.shares.numpy() > 1e-6])
+    _, fade = _nearest_along(rig, paired, 0.01)
+    pieces = connected_pieces(rig.faces.numpy(), len(rig.neutral))
+    held = np.isin(pieces, pieces[paired])
+    return (fade == 0) & held, held
 
 
 @dataclass(frozen=True)
@@ -420,62 +469,79 @@ def transfer_correspondence(
 
     Returns:
         Each vertex of the source with its closest point on the target, then each vertex of the target with its closest
-        point on the deformed source. Confidence falls with the distance left, and is 0 where the normals are more than
-        a right angle apart.
+        point on the deformed source; vertices of connected pieces with markers only, since an eyeball left to itself
+        would find a lid. Confidence falls with the distance left, and is 0 where the normals are more than a right
+        angle apart.
 
-    Source: Sumner & Popović 2004, Sec. 4, Eqs. 9 to 12. Their weights depend on the size of the meshes, which they do
-    not tell: we scale the target's box to a diagonal of 1. Ours too: markers hold to about a millionth, not exactly;
-    the source starts from the similarity that brings them closest; pieces without markers keep their place at first;
-    and a vertex whose closest point faces away is left free, where the paper searches on for one that does not.
+    Source: Sumner & Popović 2004, E_S, E_I and E_C of the section on correspondence. Their weights depend on the size
+    of the meshes, which they do not tell: we scale the target's box to a diagonal of 1. Ours too: markers hold to about
+    a millionth, not exactly; the source starts from the similarity that brings them closest; and a vertex whose closest
+    point faces away is left free, where the paper searches on for one that does not.
     """
     config = config or CorrespondenceConfig()
     _check_belongs(source, target, markers)
+    (own, source_faces), (theirs, target_faces) = (
+        _pieces_with(source, markers.source),
+        _pieces_with(target, markers.target),
+    )
     size = float(np.linalg.norm(np.ptp(target.neutral.numpy(), axis=0)))
-    goal, wanted = target.neutral.double() / size, markers.target.of(target.neutral.double() / size)
+    goal, wanted = target.neutral.double()[theirs] / size, markers.target.of(target.neutral.double()) / size
     scale, rotation, translation = similarity_fit(markers.source.of(source.neutral.double()), wanted)
-    start = scale * source.neutral.double() @ rotation.T + translation
+    start = scale * source.neutral.double()[own] @ rotation.T + translation
     count = len(start)
 
     # Unknowns are the vertices, then a fourth one for each face: along its normal it must be smooth as well.
-    unknown = torch.cat([start, start[source.faces[:, 0]] + face_frames(start, source.faces)[..., 2]]).numpy()
-    operator = _full_gradients(start, source.faces, sound_faces(start, source.faces).numpy())  # (3 F, V + F)
-    first, second = _neighbours(source.faces.numpy())
+    unknown = torch.cat([start, start[source_faces[:, 0]] + face_frames(start, source_faces)[..., 2]]).numpy()
+    operator = _full_gradients(start, source_faces)  # (3 F, V + F)
+    first, second = _neighbours(source_faces.numpy())
     rows = 3 * np.stack([first, second])[..., None] + np.arange(3)  # (2, pairs, 3)
     differences = operator[rows[0].ravel()] - operator[rows[1].ravel()]
-    units = np.tile(np.eye(3), (len(source.faces), 1))
-    sampled = _sampling(markers.source, len(unknown))
+    units = np.tile(np.eye(3), (len(source_faces), 1))
+    sampled = _sampling(markers.source, len(source.neutral))[:, own.numpy()]
+    sampled = csr_array((sampled.data, sampled.indices, sampled.indptr), shape=(len(markers), len(unknown)))
     smooth = config.smoothness * (differences.T @ differences) + config.identity * (operator.T @ operator)
+    # The last term keeps what nothing else determines, like a vertex without faces, where it starts.
     fixed = smooth + 1e6 * (sampled.T @ sampled) + 1e-6 * diags_array(np.ones(len(unknown)))
     fixed_side = config.identity * (operator.T @ units) + 1e6 * (sampled.T @ wanted.numpy()) + 1e-6 * unknown
     for weight in (0.0, *config.closeness):
         pulled = np.zeros(len(unknown))
         side = fixed_side.copy()
         if weight > 0:
-            places, _, agreement = _project(torch.from_numpy(unknown[:count]), source.faces, goal, target.faces)
+            places, _, agreement = _project(torch.from_numpy(unknown[:count]), source_faces, goal, target_faces)
             pulled[:count] = weight * (agreement > 0).double().numpy()
             side[:count] += pulled[:count, None] * places.of(goal).numpy()
-        matrix = (fixed + diags_array(pulled)).tocsc()
-        unknown = splu(
-            matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        ).solve(side)
+        unknown = _factored(fixed + diags_array(pulled)).solve(side)
 
     deformed = torch.from_numpy(unknown[:count])
-    there, there_gap, there_agreement = _project(deformed, source.faces, goal, target.faces)
-    back, back_gap, back_agreement = _project(goal, target.faces, deformed, source.faces)
-    own, theirs = Places.at(torch.arange(count)), Places.at(torch.arange(len(goal)))
+    there, there_gap, there_agreement = _project(deformed, source_faces, goal, target_faces)
+    back, back_gap, back_agreement = _project(goal, target_faces, deformed, source_faces)
     gap = torch.cat([there_gap, back_gap]) * size / float(np.ptp(target.neutral[:, 1].numpy()))
     confidence = torch.exp(-gap / config.distance) * (torch.cat([there_agreement, back_agreement]) > 0)
     return Correspondence(
-        Places(torch.cat([own.corners, back.corners]), torch.cat([own.shares, back.shares])),
-        Places(torch.cat([there.corners, theirs.corners]), torch.cat([there.shares, theirs.shares])),
+        _joined(Places.at(own), Places(own[back.corners], back.shares)),
+        _joined(Places(theirs[there.corners], there.shares), Places.at(theirs)),
         confidence.float(),
     )
 
 
-def _full_gradients(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"], sound: ndarray) -> csr_array:
-    """(3 F, V + F) matrix from vertices, and a fourth one for each face, to gradients. Source: S&P 2004, Eq. 4."""
-    frames = torch.where(torch.from_numpy(sound)[:, None, None], face_frames(vertices, faces), torch.eye(3).double())
-    slopes = torch.linalg.inv(frames).numpy() * sound[:, None, None]  # (F, 3 corners after the first, 3 axes)
+def _pieces_with(rig: Rig, places: Places) -> tuple[Int[Tensor, "V"], Int[Tensor, "F 3"]]:
+    """Vertices of the connected pieces that hold a place, and the faces between them, by their new numbers."""
+    pieces = connected_pieces(rig.faces.numpy(), len(rig.neutral))
+    chosen = np.isin(pieces, pieces[places.corners.numpy()[places.shares.numpy() > 1e-6]])
+    number = torch.from_numpy(np.cumsum(chosen) - 1)
+    return torch.from_numpy(np.flatnonzero(chosen)), number[rig.faces[torch.from_numpy(chosen)[rig.faces[:, 0]]]]
+
+
+def _factored(matrix: sparray) -> SuperLU:
+    """Factors of a symmetric, positive definite matrix: no pivoting, so that the order that keeps them sparse holds."""
+    return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _full_gradients(vertices: Float[Tensor, "V 3"], faces: Int[Tensor, "F 3"]) -> csr_array:
+    """(3 F, V + F) matrix from vertices, and a fourth one for each face, to gradients. Source: Q = V~ V^-1."""
+    sound = sound_faces(vertices, faces)[:, None, None]
+    frames = torch.where(sound, face_frames(vertices, faces), torch.eye(3, dtype=vertices.dtype))
+    slopes = (torch.linalg.inv(frames) * sound).numpy()  # (F, 3 corners after the first, 3 axes)
     slopes = np.concatenate([-slopes.sum(1, keepdims=True), slopes], 1)  # (F, 4, 3)
     corners = np.concatenate([faces.numpy(), len(vertices) + np.arange(len(faces))[:, None]], 1)  # (F, 4)
     rows = np.broadcast_to(3 * np.arange(len(faces))[:, None, None] + np.arange(3), slopes.shape)

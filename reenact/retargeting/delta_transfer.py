@@ -25,14 +25,13 @@ from torch import Tensor
 from reenact.geometry import similarity_fit, vertex_normals
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import (
-    Completion,
+    Explanation,
     apply_sparse,
     check_names,
     connected_pieces,
     densify,
     vertex_pairs,
 )
-from reenact.retargeting.inverse_rig import InverseRig, nonnegative_least_squares
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
@@ -55,7 +54,7 @@ class DeltaTransfer:
         Args:
             source: Where motion comes from.
             target: Where it goes to.
-            correspondence: Dense pairs, or markers; see `DeformationTransfer`.
+            correspondence: Pairs; see `densify`.
             training: Not used.
             scale: `head` takes the ratio of sizes of the whole heads, `local` that of the surface around each vertex.
             turn: Turn each offset by the smallest rotation that takes the source's normal to the target's.
@@ -82,17 +81,17 @@ class DeltaTransfer:
             turns = smallest_rotations(partner_normals, vertex_normals(target.neutral, target.faces).double())
             offsets = torch.einsum("vij,kvj->kvi", turns, offsets)
         pieces = connected_pieces(target.faces.numpy(), len(target.neutral))
-        offsets = Completion(target, pieces, followed.sum(1))(offsets)
+        self._explanation = Explanation(target, pieces, followed.sum(1))
+        self._projection = self._explanation.projections(offsets)  # (Ks, Kt)
+        offsets = self._explanation.complete(offsets)
         name = f"{source.name} on {target.name}"
         self.shapes = Rig(name, target.neutral, offsets.float(), source.names, target.faces)
         """The source's shapes on the target's mesh."""
-        self._inverse = InverseRig(target)
-        self._projection = self._inverse.projections(target.neutral.double() + offsets)  # (Ks, Kt)
 
     def __call__(self, clip: Clip) -> Clip:
         """The clip on the target: bounded least squares of `vertices(clip)`, weights in [0, 1]."""
         check_names(self.source, clip)
-        weights = nonnegative_least_squares(self._inverse.gram, clip.weights.double() @ self._projection, high=1.0)
+        weights = self._explanation.weights(clip.weights.double() @ self._projection)
         return Clip(self.target.names, weights.float(), clip.fps)
 
     def vertices(self, clip: Clip) -> Float[Tensor, "T V 3"]:

@@ -28,7 +28,7 @@ from reenact.errors import ReenactError
 from reenact.geometry import face_frames, farthest_points
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import DeformationTransfer, check_names, densify
-from reenact.retargeting.inverse_rig import nonnegative_least_squares
+from reenact.retargeting.inverse_rig import InverseRig, nonnegative_least_squares
 from reenact.retargeting.rbf import carry_shapes
 from reenact.rigs import motion
 from reenact.rigs.clip import Clip
@@ -78,7 +78,7 @@ class FacialRigging:
         Args:
             source: The actor.
             target: The generic rig.
-            correspondence: Dense pairs, or markers; see `DeformationTransfer`.
+            correspondence: Pairs; see `densify`.
             training: Source clip that examples are chosen from; a minute of synthetic motion where None.
             config: How far the examples may change the rig.
             examples: Meshes of the source to use instead.
@@ -117,13 +117,13 @@ class FacialRigging:
             f"{target.name} as {source.name}", source.neutral, personal.float(), target.names, source.faces
         )
         """The target's shapes on the source's mesh."""
-        self._gram = personal.flatten(1) @ personal.flatten(1).T
-        self._projection = source.deltas.double().flatten(1) @ personal.flatten(1).T  # (Ks, Kt)
+        self._inverse = InverseRig(self.personalised, importance=carried.covered)
+        self._projection = self._inverse.projections(source.vertices(torch.eye(len(source.names))))  # (Ks, Kt)
 
     def __call__(self, clip: Clip) -> Clip:
         """The clip on the target, weights in [0, 1]."""
         check_names(self.source, clip)
-        weights = nonnegative_least_squares(self._gram, clip.weights.double() @ self._projection, high=1.0)
+        weights = nonnegative_least_squares(self._inverse.gram, clip.weights.double() @ self._projection, high=1.0)
         return Clip(self.target.names, weights.float(), clip.fps)
 
 
@@ -171,20 +171,26 @@ class Rigging:
             weights: Weights of the generic rig that they stand for, about.
             config: How far both may change.
 
-        Source: Li et al. 2010, Eqs. 4 to 8.
+        Source: Li et al. 2010, the alternating optimization. Their frames have the normal as a third column, which
+        never reaches the vertices: the solve sees only what lies in the plane of a face. Ours leave it out.
         """
         generic_rig, actor = carried.source, carried.target
         neutral = actor.neutral.double()
         frames = face_frames(neutral, actor.faces)[..., :2]  # (F, 3, 2) M_0^B
-        self._carried, self._config, self._inverse = carried, config, torch.linalg.pinv(frames)
+        size = frames.flatten(1).norm(dim=1).clamp_min(1e-12)
         shapes = generic_rig.vertices(torch.eye(len(generic_rig.names))).double()
         # M_i^A* = (M_0^A + M_i^A) (M_0^A)^-1 M_0^B - M_0^B: deformation transfer, before it is put together.
-        self.generic = torch.cat([_rows(carried.gradients(part) @ frames) for part in shapes.split(8)], 1)  # (F, K, 6)
-        size = frames.flatten(1).norm(dim=1).clamp_min(1e-12)
-        moved = self.generic.norm(dim=2) / size[:, None]
+        generic = torch.cat([_rows(carried.gradients(part) @ frames) for part in shapes.split(8)], 1)  # (F, K, 6)
+        wanted = _rows(face_frames(examples, actor.faces)[..., :2] - frames)  # (F, J, 6) M_j^S - M_0^B
+        # Most of a head never moves; what is left are the F faces of all that follows.
+        self._moving = torch.cat([generic, wanted], 1).abs().amax((1, 2)) > 1e-6 * size
+        self._carried, self._inverse = carried, torch.linalg.pinv(frames[self._moving])  # (F, 2, 3)
+        self.generic, self._wanted = generic[self._moving], wanted[self._moving]
+        moved = self.generic.norm(dim=2) / size[self._moving, None]
         self.trust = ((1 + moved) / (config.kappa + moved)) ** config.theta  # (F, K) omega
-        self._wanted = _rows(face_frames(examples, actor.faces)[..., :2] - frames)  # (F, J, 6) M_j^S - M_0^B
-        self._offsets = (examples - neutral).flatten(1)  # (J, 3 V)
+        # Where nothing is known of the generic rig, an example says nothing about its weights.
+        self._scale = carried.covered.sqrt()[:, None]
+        self._offsets = ((examples - neutral) * self._scale).flatten(1)  # (J, 3 V)
         self.guess = self.weights = weights
         self.edges = self.generic
         self.deltas = self._integrate()
@@ -210,14 +216,14 @@ class Rigging:
         products = torch.einsum("ik,jk->kij", alpha, alpha).flatten(1)  # (K, J J)
         systems = (slack @ products).unflatten(1, (len(alpha),) * 2)  # (F, J, J)
         systems = systems + beta * torch.eye(len(alpha), dtype=alpha.dtype)
-        missing = self._wanted - torch.einsum("jk,fkc->fjc", alpha, self.generic)
+        missing = self._wanted - alpha @ self.generic  # (F, J, 6)
         shares = torch.linalg.solve(systems, missing)  # (F, J, 6)
-        self.edges = self.generic + slack[..., None] * torch.einsum("jk,fjc->fkc", alpha, shares)
+        self.edges = torch.addcmul(self.generic, slack[..., None], alpha.T @ shares)
         self.deltas = self._integrate()
 
     def fit_weights(self, gamma: float) -> None:
         """Step B: the weights of each example in [0, 1] that show it best without leaving the guess."""
-        flat = self.deltas.flatten(1)
+        flat = (self.deltas * self._scale).flatten(1)
         gram = flat @ flat.T
         pull = gamma * float(gram.diagonal().mean())
         system = gram + pull * torch.eye(len(gram), dtype=gram.dtype)
@@ -225,24 +231,24 @@ class Rigging:
 
     def shape_energy(self, beta: float) -> float:
         """What step A minimises: the examples' edges missed, and the way from the generic ones."""
-        missed = self._wanted - torch.einsum("jk,fkc->fjc", self.weights, self.edges)
-        strayed = self.trust * (self.edges - self.generic).square().sum(2)
-        return float(missed.square().sum() + beta * strayed.sum())
+        missed = self._wanted - self.weights @ self.edges
+        strayed = self.trust * (self.edges - self.generic).norm(dim=2) ** 2
+        return float(missed.norm() ** 2 + beta * strayed.sum())
 
     def weight_energy(self, gamma: float) -> float:
         """What step B minimises: the examples' vertices missed, and the way from the guessed weights."""
-        flat = self.deltas.flatten(1)
+        flat = (self.deltas * self._scale).flatten(1)
         missed = self._offsets - self.weights @ flat
         pull = gamma * float(flat.square().sum(1).mean())
         return float(missed.square().sum() + pull * (self.weights - self.guess).square().sum())
 
     def _integrate(self) -> Tensor:
         """Vertices of the shapes from their edges, by one solve."""
-        edges = self.edges.unflatten(2, (3, 2)).transpose(0, 1)  # (K, F, 3, 2)
-        parts = [
-            self._carried.settle(part @ self._inverse, offsets)
-            for part, offsets in zip(edges.split(8), self._carried.source.deltas.double().split(8))
-        ]
+        parts = []
+        for edges, offsets in zip(self.edges.split(8, dim=1), self._carried.source.deltas.double().split(8)):
+            gradients = edges.new_zeros(len(offsets), len(self._moving), 3, 3)
+            gradients[:, self._moving] = edges.transpose(0, 1).unflatten(2, (3, 2)) @ self._inverse
+            parts.append(self._carried.settle(gradients, offsets))
         return torch.cat(parts)
 
 
