@@ -79,25 +79,33 @@ class Correspondence:
     def sample(self, rig: Rig, count: int = MARKERS) -> Correspondence:
         """Pairs spread over the face that the source's shapes move, denser where more of them move it.
 
-        That is around mouth and eyes, as markers are set for capture; pairs that are not sure are avoided. Ours.
+        That is around mouth and eyes, as markers are set for capture. Each is the surest of the pairs around its place.
+        Ours.
 
         Args:
             rig: The source.
-            count: Pairs; all of them where there are no more.
+            count: Pairs; as many as there are that move, where that is fewer.
 
         Raises:
-            ReenactError: The shapes move none of the pairs.
+            ReenactError: The shapes move fewer than four of the pairs.
         """
         reach = rig.deltas.norm(dim=-1).amax(1)  # (K,)
         motion = self.source.of(rig.deltas).norm(dim=-1)  # (K, N)
-        live = reach > 0.02 * reach.max()  # What hardly moves anything would count in full otherwise.
-        strength = (motion[live] / reach[live, None]).square().sum(0).sqrt()
-        weights = strength * self.confidence.square()
-        weights = torch.where(weights > 1e-3 * weights.max(), weights, 0)
-        available = int((weights > 0).sum())
-        if available < 4:
-            raise ReenactError(f"{rig.name}: expected at least 4 pairs that its shapes move, got {available}")
-        return self[farthest_points(self.source.of(rig.neutral), min(count, available), weights)]
+        live = reach > registration.STILL * reach.max()
+        strength = (motion[live] / reach[live, None]).square().sum(0)  # the more shapes, and the nearer to their middle
+        weights = (strength.sqrt() * self.confidence).sqrt()
+        weights = torch.where(weights > 1e-2 * weights.max(), weights, 0)
+        moving = int((weights > 0).sum())
+        if moving < 4:
+            raise ReenactError(f"{rig.name}: expected at least 4 pairs that its shapes move, got {moving}")
+        points = self.source.of(rig.neutral)
+        spread = farthest_points(points, min(count, moving), weights)
+        eligible = weights.nonzero().flatten()
+        cell = torch.cdist(points[eligible], points[spread]).argmin(1)
+        order = self.confidence[eligible].argsort(stable=True)  # so that the surest of each cell is written last
+        surest = spread.clone()
+        surest[cell[order]] = eligible[order]
+        return self[surest]
 
     def reversed(self) -> Correspondence:
         """The same pairs from the target to the source."""

@@ -43,7 +43,7 @@ summed over shapes by squares."""
 _SURFACE_PARTS = ("skin", "lips", "brows")
 _MARGIN = 0.2
 """Still skin around what moves that belongs to a face, in face heights: the other rig may move more."""
-_STILL = 0.02
+STILL = 0.02
 """A shape that moves the face by less than this share of the farthest moving one says nothing about it."""
 _FLOOR = 0.003
 """Share of a shape's farthest motion below which its logarithm flattens."""
@@ -54,7 +54,12 @@ _SCALES = (0.1, 0.2, 0.2, 0.15, 0.1, 0.07, 0.05, 0.04, 0.03, 0.03)
 """Standard deviation of a partner's position, coarse to fine, in face heights."""
 _COARSE_SCALES = (0.1, 0.2, 0.15, 0.1)
 _COARSE_BENDING = (1e-1, 1e-2)
-_BENDING = (1e-2, 1e-3)
+_BELIEF = 1.2
+"""What disagreement of motion as large as usual counts, in standard deviations of the position."""
+_DISAGREEMENT = 0.02
+"""Share of the spread of motion that halves its weight where partners disagree by so much. Between heads of one
+sculptor it is 0.002 to 0.006, between heads of two 0.06 to 0.07."""
+_BENDING = (1e-1, 5e-3)
 """Weight of the bending energy of the deformation, first and last; the published schemes also loosen as they go."""
 _DRIFT = 0.1
 """By how much a pair is off per distance from the next landmark; measured."""
@@ -109,7 +114,7 @@ class Face:
         farthest = motion.max(1, keepdims=True)
         if farthest.max() <= 1e-9:
             raise ReenactError(f"{rig.name}: expected shapes that move the face, got none; did the export keep them?")
-        live = farthest[:, 0] > _STILL * farthest.max()
+        live = farthest[:, 0] > STILL * farthest.max()
         strength = np.sqrt(np.square(motion[live] / farthest[live]).sum(0))
         sheet = _sheet(rig, points, faces, strength)
         moving = sheet & (strength > MOVING)
@@ -194,7 +199,7 @@ def pairs_by_name(source: Sequence[str], target: Sequence[str]) -> Pairs:
 def _groups(face: Face) -> list[Group]:
     """Each shape that moves the face, and the two of each mirrored pair together."""
     reach = np.linalg.norm(face.deltas, axis=-1).max(1)
-    single = [int(k) for k in np.flatnonzero(reach > _STILL * reach.max())]
+    single = [int(k) for k in np.flatnonzero(reach > STILL * reach.max())]
     middle = np.median(face.points[face.strength > MOVING, 0])
     mirror = np.array([-1.0, 1.0, 1.0])
     partner = cKDTree(face.points).query(face.points * mirror + [2 * middle, 0, 0])[1]
@@ -331,7 +336,7 @@ def _moving(source: Face, target: Face, pairs: Pairs) -> Pairs:
 
     def moves(face: Face, group: Group) -> bool:
         reach = np.linalg.norm(face.deltas, axis=-1).max()
-        return np.linalg.norm(face.deltas[list(group)].sum(0), axis=-1).max() > _STILL * reach
+        return np.linalg.norm(face.deltas[list(group)].sum(0), axis=-1).max() > STILL * reach
 
     return tuple(pair for pair in pairs if moves(source, pair[0]) and moves(target, pair[1]))
 
@@ -492,6 +497,8 @@ def _match(
     points, normals = rest, source.normals @ start.rotation.T
     smooth, search = _Smoother(source), _Search(target, theirs)
     metric = np.zeros((ours.shape[1], ours.shape[1]))  # of features: what their disagreement between partners teaches
+    moved = source.areas * np.minimum(1, source.strength)
+    spread = float(moved @ np.square(ours - np.average(ours, axis=0, weights=moved)).sum(1) / moved.sum())
     for step, scale in enumerate(scales):
         match = search(points, normals, ours, scale, metric)
         features = match.of(theirs)
@@ -501,9 +508,8 @@ def _match(
         stiffness = bending[0] * (bending[1] / bending[0]) ** (step / (len(scales) - 1))
         points = rest + smooth(match.of(target.points) - rest, trust, stiffness * scale**2)
         normals = _normals(points, source.faces)
-        if step:
-            ours = original + smooth(features - original, trust, _FEATURE_BENDING)
-        metric = _metric(ours - features, trust * source.areas)
+        ours = original + smooth(features - original, trust, _FEATURE_BENDING)
+        metric = _metric(ours - features, trust * source.areas, spread)
     match = search(points, normals, ours, scales[-1], metric)
     sharpness = _sharpness(target, np.concatenate([target.normals * _NORMAL_WEIGHT, theirs @ metric], 1))
     return match, match.distance / match.of(sharpness[:, None])[:, 0].clip(1)
@@ -570,16 +576,18 @@ def _normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return vertex_normals(torch.from_numpy(points), torch.from_numpy(faces)).numpy()
 
 
-def _metric(difference: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def _metric(difference: Float[np.ndarray, "N D"], weights: Float[np.ndarray, "N"], spread: float) -> np.ndarray:
     """Divides features by how much they disagree between partners: the inverse root of their covariance.
 
-    What two sculptors did differently, or two people do, thus counts for less than what they agree on.
+    What two sculptors did differently, or two people do, thus counts for less than what they agree on. Where they
+    disagree in a large share of all that there is to know (`spread`), motion as a whole counts for less than place.
     """
     covariance = difference.T @ (difference * (weights / weights.sum())[:, None])
-    size = len(covariance)
-    covariance += 0.1 * np.trace(covariance) / size * np.eye(size)
+    size, unexplained = len(covariance), np.trace(covariance)
+    covariance += 0.1 * unexplained / size * np.eye(size)
     values, vectors = np.linalg.eigh(covariance)
-    return 0.9 / np.sqrt(size) * vectors @ np.diag(values**-0.5) @ vectors.T
+    belief = _BELIEF / (1 + unexplained / spread / _DISAGREEMENT)
+    return belief / np.sqrt(size) * vectors @ np.diag(values.clip(1e-12) ** -0.5) @ vectors.T
 
 
 def _halfway(source: Face, target: Face, there: _Match, back: _Match) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
