@@ -158,12 +158,21 @@ def test_faces_follow_themselves_between_equal_topologies(toy_pair):
     np.testing.assert_array_equal(face_pairs(source, target, followed).toarray(), np.eye(len(source.faces)))
 
 
-def test_confidence_blends_towards_stiffness(toy_pair):
+def test_confidence_weighs_pairs_against_each_other_and_does_not_stiffen(toy_pair):
     source, target = toy_pair
     pairs = Correspondence.identity(source, target)
     unsure = replace(pairs, confidence=torch.full((len(pairs),), 0.25))
-    sure, blended = (DeformationTransfer(source, target, c).shapes.deltas for c in (pairs, unsure))
-    torch.testing.assert_close(blended, 0.25 * sure, rtol=0, atol=1e-6)
+    expected, found = (DeformationTransfer(source, target, c).shapes.deltas for c in (pairs, unsure))
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-7)
+    # Three pairs meet at vertex 3 of the target: with 5 of the source at 0.75, with 6 at 0.25, with 7 at 0.
+    doubled = Correspondence(
+        Places.at(torch.tensor([5, 6, 7, 0])),
+        Places.at(torch.tensor([3, 3, 3, 0])),
+        torch.tensor([0.75, 0.25, 0.0, 1.0]),
+    )
+    row = vertex_pairs(source, target, doubled, reach=0.01).toarray()[3]
+    np.testing.assert_allclose(row[[5, 6, 7]], [0.75, 0.25, 0.0])
+    assert row.sum() == pytest.approx(1)
 
 
 def test_pairs_speak_up_to_their_reach_and_fade_to_its_double(toy_pair):

@@ -310,15 +310,16 @@ class Explanation:
 
 
 def vertex_pairs(source: Rig, target: Rig, correspondence: Correspondence, reach: float) -> csr_array:
-    """(Vt, Vs) shares of source vertices that each vertex of the target follows; a row sums to how far it follows.
+    """(Vt, Vs) shares of the source in each vertex of the target; a row sums to how far it follows, from 0 to 1.
 
     A vertex takes the mean of the pairs at it, by confidence and closeness. Without one, it takes after the paired
-    vertex that is nearest along the surface: never after the other lip, however close.
+    vertex that is nearest along the surface: never after the other lip, however close. An unsure pair yields to a surer
+    one, but alone it counts fully: stiffening where in doubt shrinks every expression.
 
     Args:
         source: The columns.
         target: The rows.
-        correspondence: Pairs; confidence becomes the sum of a row.
+        correspondence: Pairs; those with a confidence of 0 are left out.
         reach: Distance in heights of the target up to which pairs speak for their neighbours; it fades to the double.
 
     Raises:
@@ -331,7 +332,6 @@ def vertex_pairs(source: Rig, target: Rig, correspondence: Correspondence, reach
     total = votes.sum(1)
     paired = np.flatnonzero(total > 1e-6)
     shares = diags_array(1 / total[paired]) @ votes[paired]
-    shares = diags_array(shares @ confidence) @ shares  # the means of the pairs, times their confidence
     nearest, fade = _nearest_along(target, paired, reach)
     chosen = np.flatnonzero(fade > 0)
     rows = coo_array((fade[chosen], (chosen, nearest[chosen])), shape=(len(total), len(paired))).tocsr()
