@@ -196,6 +196,16 @@ def test_half_a_correspondence_is_completed(toy_pair):
     assert torch.equal(whole.source.corners[: len(front)], front.source.corners)
     shapes = DeformationTransfer(source, target, front).shapes.deltas
     assert relative(shapes, transfer(source, target).shapes.deltas) < 0.05
+    # A wrong pair that says so is left to the others; one of a hundred or fewer would stay.
+    wrong = replace(front, target=Places.at(front.target.corners[:, 0].roll(1)), confidence=front.confidence * 0.2)
+    both = Correspondence(
+        Places.at(torch.cat([front.source.corners[:, 0], wrong.source.corners[:, 0]])),
+        Places.at(torch.cat([front.target.corners[:, 0], wrong.target.corners[:, 0]])),
+        torch.cat([front.confidence, wrong.confidence]),
+    )
+    kept = densify(source, target, both)
+    assert len(kept) == len(whole)
+    assert torch.equal(kept.target.corners, whole.target.corners)
 
 
 def test_a_vertex_takes_after_the_paired_one_nearest_along_the_surface_and_never_after_another_piece():

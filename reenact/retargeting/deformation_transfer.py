@@ -405,12 +405,12 @@ def face_pairs(source: Rig, target: Rig, followed: csr_array) -> csr_array:
 
 
 def densify(source: Rig, target: Rig, correspondence: Correspondence | None) -> Correspondence:
-    """The correspondence itself if it covers the target; else with pairs added where it has none.
+    """The correspondence itself if it covers the target; else with its gaps filled.
 
     Gradients must be known between what moves and what rests, or the face drifts. Where a tenth of the target's
-    vertices or more is not close to a pair, 300 pairs, the surest first, serve as markers of `transfer_correspondence`,
-    whose pairs fill the gaps on both rigs. Connected pieces without any given pair stay without, and do not count: an
-    eyeball has no partner in a lid.
+    vertices or more is not close to a pair, 300 pairs serve as markers of `transfer_correspondence`, whose pairs fill
+    the gaps on both rigs. Then unsure pairs, below 0.3, are better left to it too, unless fewer than a hundred stay.
+    Connected pieces without any given pair stay without, and do not count: an eyeball has no partner in a lid.
 
     Raises:
         ReenactError: There is no correspondence, or it belongs to other rigs.
@@ -418,20 +418,21 @@ def densify(source: Rig, target: Rig, correspondence: Correspondence | None) -> 
     if correspondence is None:
         raise ReenactError(f"{source.name} to {target.name}: expected a correspondence, got none; let it be found")
     _check_belongs(source, target, correspondence)
-    source_gaps, _ = _gaps(source, correspondence.source)
-    target_gaps, pieces = _gaps(target, correspondence.target)
-    if target_gaps.sum() < 0.1 * pieces.sum():
+    gaps, held = _gaps(target, correspondence.target)
+    if gaps.sum() < 0.1 * held.sum():
         return correspondence
-    count = min(300, int((correspondence.confidence > 0).sum()))
-    places = correspondence.source.of(source.neutral)
-    markers = correspondence[farthest_points(places, count, correspondence.confidence)]
+    best = correspondence.confidence.sort(descending=True).values[:100]
+    sure = correspondence[(correspondence.confidence >= best[-1].clamp_max(0.3)).nonzero().flatten()]
+    count = min(300, int((sure.confidence > 0).sum()))
+    markers = sure[farthest_points(sure.source.of(source.neutral), count, sure.confidence)]
     dense = transfer_correspondence(source, target, markers)
+    source_gaps, target_gaps = _gaps(source, sure.source)[0], _gaps(target, sure.target)[0]
     fills = source_gaps[dense.source.corners.numpy()].all(1) | target_gaps[dense.target.corners.numpy()].all(1)
     added = torch.from_numpy(np.flatnonzero(fills))
     return Correspondence(
-        _joined(correspondence.source, dense.source[added]),
-        _joined(correspondence.target, dense.target[added]),
-        torch.cat([correspondence.confidence, dense.confidence[added]]),
+        _joined(sure.source, dense.source[added]),
+        _joined(sure.target, dense.target[added]),
+        torch.cat([sure.confidence, dense.confidence[added]]),
     )
 
 
