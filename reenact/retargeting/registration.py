@@ -50,18 +50,20 @@ _FLOOR = 0.003
 _DIMENSIONS = 80
 """Principal components that the motion of all shapes is reduced to."""
 _NORMAL_WEIGHT = 6.0
-_SCALES = (0.1, 0.2, 0.2, 0.15, 0.1, 0.07, 0.05, 0.04, 0.03, 0.03)
+_SCALES = (0.1, 0.2, 0.2, 0.2, 0.15, 0.1, 0.07, 0.05, 0.04, 0.03, 0.03)
 """Standard deviation of a partner's position, coarse to fine, in face heights."""
 _COARSE_SCALES = (0.1, 0.2, 0.15, 0.1)
 _COARSE_BENDING = (1e-1, 1e-2)
-_BELIEF = 1.2
+_BELIEF = 1.5
 """What disagreement of motion as large as usual counts, in standard deviations of the position."""
 _DISAGREEMENT = 0.02
 """Share of the spread of motion that halves its weight where partners disagree by so much. Between heads of one
 sculptor it is 0.002 to 0.006, between heads of two 0.06 to 0.07."""
 _BENDING = (1e-1, 5e-3)
 """Weight of the bending energy of the deformation, first and last; the published schemes also loosen as they go."""
-_DRIFT = 0.1
+_SETTLING = 1e-7
+"""The same for the last step, which lets sure pairs correct unsure ones between them."""
+_DRIFT = 0.15
 """By how much a pair is off per distance from the next landmark; measured."""
 _FEATURE_BENDING = 1e-4
 """The same for the slowly changing difference between both rigs' motion."""
@@ -118,16 +120,16 @@ class Face:
         strength = np.sqrt(np.square(motion[live] / farthest[live]).sum(0))
         sheet = _sheet(rig, points, faces, strength)
         moving = sheet & (strength > MOVING)
+        if moving.sum() < 20:
+            raise ReenactError(
+                f"{rig.name}: expected a face that its shapes move, got {int(moving.sum())} connected vertices "
+                "that move; check the parts and the deltas"
+            )
         low, high = (np.quantile(points[moving, 1], share) for share in (0.02, 0.98))
         height = float(high - low)
         near = cKDTree(points[moving]).query(points, distance_upper_bound=max(_MARGIN * height, 1e-9))[0] < np.inf
         kept = faces[(sheet & near)[faces].all(1)]
         vertices = np.unique(kept)
-        if len(vertices) < 20 or height <= 0:
-            raise ReenactError(
-                f"{rig.name}: expected a face that its shapes move, got {len(vertices)} connected vertices that move; "
-                "check the parts and the deltas"
-            )
         numbers = np.full(len(points), -1)
         numbers[vertices] = np.arange(len(vertices))
         own_faces, own_points = numbers[kept], points[vertices]
@@ -308,18 +310,21 @@ def register(source: Rig, target: Rig, use_names: bool = True) -> Registration:
             match, _ = _match(*faces, pairs, start, _COARSE_SCALES, _COARSE_BENDING)
             pairs = _moving(*faces, _pairs_by_motion(*faces, start.rotation, match))
     _need(source, target, pairs)
-    there, slide = _match(*faces, pairs, _centres_aligned(*faces, pairs), _SCALES, _BENDING)
+    start = _centres_aligned(*faces, pairs)
+    there, slide = _match(*faces, pairs, start, _SCALES, _BENDING)
     swapped = tuple((theirs, ours) for ours, theirs in pairs)
     back, _ = _match(*faces[::-1], swapped, _centres_aligned(*faces[::-1], swapped), _SCALES, _BENDING)
-    corners, shares, gap = _halfway(*faces, there, back)
-    moving = np.flatnonzero(faces[0].strength > MOVING)
+    partners, gap = _halfway(*faces, there, back)
+    # What both directions make of a place, and how far motion lets it slide: off by either where the other is small, it
+    # is off by their geometric mean, as measured where the truth is known.
     error = np.sqrt((gap + 1e-3) * (slide + 1e-3))
+    rest = start(faces[0].points)
+    trust = np.minimum(np.square(0.01 / error), 10)
+    settled = rest + _Smoother(faces[0])(partners - rest, trust, _SETTLING)  # the sure places hold the others
+    corners, shares = _onto(faces[1], settled, _normals(settled, faces[0].faces))
+    moving = np.flatnonzero(faces[0].strength > MOVING)
     return Registration(
-        faces[0].vertices[moving],
-        faces[1].vertices[corners[moving]],
-        shares[moving],
-        error[moving],
-        pairs,
+        faces[0].vertices[moving], faces[1].vertices[corners[moving]], shares[moving], error[moving], pairs
     )
 
 
@@ -336,7 +341,7 @@ def _moving(source: Face, target: Face, pairs: Pairs) -> Pairs:
 
     def moves(face: Face, group: Group) -> bool:
         reach = np.linalg.norm(face.deltas, axis=-1).max()
-        return np.linalg.norm(face.deltas[list(group)].sum(0), axis=-1).max() > STILL * reach
+        return bool(np.linalg.norm(face.deltas[list(group)].sum(0), axis=-1).max() > STILL * reach)
 
     return tuple(pair for pair in pairs if moves(source, pair[0]) and moves(target, pair[1]))
 
@@ -403,7 +408,7 @@ def confidence(error: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
     Errors are spread about what is expected of them by a factor of 2 or so, hence the slope of the logistic curve. It
     was read off seven pairs of heads whose vertices are known to correspond: man, woman, child, toon and others.
     """
-    return 1 / (1 + (error / 0.01) ** 2)
+    return 1 / (1 + (error / 0.014) ** 2)
 
 
 def complete(
@@ -420,7 +425,7 @@ def complete(
     ]
     given = [face.points[numbers] for face, numbers in zip(faces, own)]
     spread = np.linalg.svd(given[0] - given[0].mean(0), compute_uv=False)
-    if spread[1] < 0.05 * spread[0]:
+    if spread[1] <= 0.05 * spread[0]:
         raise ReenactError("landmarks: expected them spread over the face, got them on one line")
     scale, rotation, translation = similarity_fit(*(torch.from_numpy(points) for points in given))
     start = _Similarity(float(scale), rotation.numpy(), translation.numpy())
@@ -432,10 +437,12 @@ def complete(
     weights[own[0]] = 10 * faces[0].areas.sum() / len(own[0]) / faces[0].areas[own[0]].clip(1e-12)
     offsets[own[0]] = given[1] - rest[own[0]]
     points = rest + smooth(offsets, weights, 1e-3 * _BENDING[1])
-    for size in (0.1, 0.05, 0.03):
+    for size in (0.1, 0.1, 0.07, 0.05, 0.03):
         normals = _normals(points, faces[0].faces)
         match = search(points, normals, still[0], size, metric)
-        trust = 0.3 * ((match.of(faces[1].normals) * normals).sum(1) > 0.5)
+        facing = (match.of(faces[1].normals) * normals).sum(1)
+        usual = max(1.5 * float(np.median(match.distance)), 1e-9)
+        trust = 0.3 * (facing > 0.5) / (1 + np.square(match.distance / usual))
         pull = np.where(weights[:, None] > 0, offsets, match.of(faces[1].points) - rest)
         points = rest + smooth(pull, np.where(weights > 0, weights, trust), _BENDING[1] * size**2)
     match = search(points, _normals(points, faces[0].faces), still[0], 0.03, metric)
@@ -586,32 +593,38 @@ def _metric(difference: Float[np.ndarray, "N D"], weights: Float[np.ndarray, "N"
     size, unexplained = len(covariance), np.trace(covariance)
     covariance += 0.1 * unexplained / size * np.eye(size)
     values, vectors = np.linalg.eigh(covariance)
-    belief = _BELIEF / (1 + unexplained / spread / _DISAGREEMENT)
+    belief = _BELIEF / (1 + (unexplained / spread / _DISAGREEMENT) ** 2)
     return belief / np.sqrt(size) * vectors @ np.diag(values.clip(1e-12) ** -0.5) @ vectors.T
 
 
-def _halfway(source: Face, target: Face, there: _Match, back: _Match) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Partners halfway between those found from the source and those that found their way back to it.
+def _halfway(
+    source: Face, target: Face, there: _Match, back: _Match
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N"]]:
+    """Points halfway between the partners found from the source and those that found their way back to it.
 
     Returns:
-        Corners and shares on the target, and how far both answers lie apart, in face heights.
+        The points, and how far both answers lie apart, in face heights.
     """
     ahead = there.of(target.points)
     # Where each target vertex lies on the source; the place whose answer is the source's vertex is its other partner.
-    landed = np.concatenate([back.of(source.points) / source.height, 0.1 * back.of(source.normals)], 1)
-    asked = np.concatenate([source.points / source.height, 0.1 * source.normals], 1)
-    corners, shares = _closest(asked, landed, target.faces)
+    landed = _placed(back.of(source.points), back.of(source.normals), source.height)
+    corners, shares = _closest(_placed(source.points, source.normals, source.height), landed, target.faces)
     returned = np.einsum("nci,nc->ni", target.points[corners], shares)
     gap = np.linalg.norm(ahead - returned, axis=1) / target.height
-    # Where they contradict each other, as where nothing comes back, the way there counts alone.
-    share = np.where(gap < 0.1, 0.5, 0.0)[:, None]
-    normals = 0.1 * there.of(target.normals)
-    corners, shares = _closest(
-        np.concatenate([(ahead + share * (returned - ahead)) / target.height, normals], 1),
-        np.concatenate([target.points / target.height, 0.1 * target.normals], 1),
-        target.faces,
-    )
-    return corners, shares, gap
+    # Halfway between answers that contradict each other lies nothing, or the other lid: the way there counts alone.
+    share = np.where(gap < 0.06, 0.5, 0.0)[:, None]
+    return ahead + share * (returned - ahead), gap
+
+
+def _onto(face: Face, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners and shares of the closest points of a face."""
+    places = _placed(face.points, face.normals, face.height)
+    return _closest(_placed(points, normals, face.height), places, face.faces)
+
+
+def _placed(points: np.ndarray, normals: np.ndarray, height: float) -> np.ndarray:
+    """Positions and normals in one space, where a turn by 60 degrees is as far as a tenth of the face's height."""
+    return np.concatenate([points / height, 0.1 * normals], 1)
 
 
 def _sharpness(target: Face, look: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "N"]:
