@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
@@ -69,45 +69,80 @@ def train(
 
 
 def infer(
-    run: Annotated[Positional[Path], arg(metavar="RUN")],
-    clip: Annotated[Positional[str], arg(metavar="CLIP")],
+    inputs: Annotated[Positional[tuple[str, ...]], arg(metavar="[RUN] CLIP", help_behavior_hint="")],
     *,
     out: Annotated[Path, arg(metavar="FILE")],
+    method: Annotated[str | None, arg(metavar="NAME")] = None,
+    source: Annotated[str | None, arg(metavar="RIG")] = None,
+    target: Annotated[str | None, arg(metavar="RIG")] = None,
+    correspondence: Annotated[Path | None, arg(metavar="FILE")] = None,
+    training: Annotated[str | None, arg(metavar="CLIP")] = None,
     reverse: Annotated[bool, FlagCreatePairsOff] = False,
     fps: float | None = None,
     post: PostConfig = PostConfig(),  # noqa: B008 - frozen
 ) -> None:
-    """Move a clip from a run's source rig to its target.
+    """Move a clip from a source rig to a target: with a trained run, or by a geometric method without any training.
+
+    With --method the rigs are --source and --target, or those of a RUN. Without --source, CLIP
+    holds markers tracked on an actor (.c3d, or .csv and .npz of positions), and --correspondence says where they lie on
+    the target (.csv of marker, vertex).
 
     Args:
-        run: Folder that `reenact train` wrote.
-        clip: Motion of the source rig: a .csv (Live Link Face or a plain table), .json (Audio2Face or a table), .npz,
-            .glb, .vrm, .fbx or USD file, or synthetic:SEED[:SECONDS].
+        inputs: The folder that `reenact train` wrote, where there is one, and the motion of the source rig: a .csv
+            (Live Link Face or a plain table), .json (Audio2Face or a table), .npz, .glb, .vrm, .fbx or USD file, or
+            synthetic:SEED[:SECONDS].
         out: File to write, by its suffix: .csv (.table.csv for a plain table), .npz, .json (.a2f.json for Audio2Face),
             .py (a script for Blender; .maya.py for Maya), .glb or .vrm (the avatar itself, animated), or USD.
+        method: A geometric method instead of networks; docs/methods.md compares them.
+        source: Rig that the motion comes from, with --method.
+        target: Rig that it goes to, with --method.
+        correspondence: Pairs of vertices for --method (.csv of source, target; or .npz); found unless given.
+        training: Motion that shows the source's whole range, for methods that learn from it.
         reverse: From the target to the source instead.
         fps: Frames per second of the result; those of the clip unless said.
         post: What to do to the result.
     """
     _check_out(out, _CLIP_FILES)
-    _run_config(run)
     check_config(Config(post=post), origin="command line")
-    from reenact.inference import ImageRetargeter
-    from reenact.postprocessing import postprocess
-    from reenact.rigs.files import load_clip, save_clip
+    if method is None:
+        if len(inputs) != 2:
+            raise ReenactError(
+                f"infer: expected RUN and CLIP, got {len(inputs)} arguments; without a run, choose a --method"
+            )
+        given = {"--source": source, "--target": target, "--correspondence": correspondence, "--training": training}
+        strange = [name for name, value in given.items() if value is not None]
+        if strange:
+            raise ReenactError(
+                f"infer: expected --method beside {', '.join(strange)}, got none; a run has its own rigs"
+            )
+        _run_config(inputs[0])
+        from reenact.inference import ImageRetargeter
 
-    retargeter = ImageRetargeter.load(run, reverse=reverse)
-    moved = postprocess(_at_rate(retargeter(load_clip(clip, retargeter.source)), fps), post)
-    avatar = retargeter.config.source if reverse else retargeter.config.target
-    save_clip(moved, out, retargeter.target, avatar if Path(avatar).is_file() else None)
+        retargeter: Any = ImageRetargeter.load(inputs[0], reverse=reverse)
+        names = [retargeter.config.source, retargeter.config.target][:: -1 if reverse else 1]
+        moved = _moved(retargeter, inputs[-1])
+    else:
+        moved, retargeter, names = _geometric(inputs, method, source, target, correspondence, training, reverse)
+    from reenact.postprocessing import postprocess
+    from reenact.rigs.files import save_clip
+
+    moved = postprocess(_at_rate(moved, fps), post)
+    save_clip(moved, out, retargeter.target, names[1] if Path(names[1]).is_file() else None)
     print(f"{out}: {len(moved)} frames, {moved.duration:.1f} s, {retargeter.source.name} -> {retargeter.target.name}")
 
 
 def evaluate(
-    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN [RUN ...]", help_behavior_hint="(one or more)")],
+    runs: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="RUN [RUN ...]", help_behavior_hint="(one or more)")
+    ] = (),
     *,
     frames: int = 600,
     seed: int = 0,
+    suite: Literal["geometric"] | None = None,
+    rigs: Annotated[tuple[str, ...], arg(metavar="RIG")] = (),
+    methods: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
+    seeds: int = 3,
+    json: Annotated[Path | None, arg(metavar="FILE.json")] = None,
 ) -> None:
     """Measure trained runs on clips that they have not seen, and write a report.
 
@@ -117,7 +152,16 @@ def evaluate(
         runs: Folders that `reenact train` wrote.
         frames: Frames to measure on, in all.
         seed: Of the clips; the same seed gives every run on the same rigs the same clips.
+        suite: Instead of runs: every geometric method from anny:man to the other built-in characters, by
+            correspondences that are found, on held-out clips.
+        rigs: Files of further rigs for the suite, there and back.
+        methods: Only these of the suite.
+        seeds: How many seeds of clips the suite takes, from --seed on.
+        json: Write the suite's rows here.
     """
+    if suite is not None:
+        _run_suite(rigs, methods, frames, range(seed, seed + seeds), json)
+        return
     if not runs:
         raise ReenactError("evaluate: expected at least one run folder, got none; name the folders after the command")
     for run in runs:
@@ -314,6 +358,101 @@ def _train_defaults(arguments: list[str]) -> Config:
     if run is not None and "--resume" in arguments:
         return replace(load_config(_run_config(run)), run=run)
     return Config()
+
+
+def _run_suite(
+    rigs: tuple[str, ...], methods: tuple[str, ...], frames: int, seeds: Sequence[int], json: Path | None
+) -> None:
+    from dataclasses import asdict
+    from json import dumps
+
+    from reenact.atomic import write_atomically
+    from reenact.retargeting import METHODS
+    from reenact.suite import TARGETS, run_suite, table
+
+    if json is not None:
+        _check_out(json, (".json",))
+    pairs = [("anny:man", name) for name in TARGETS]
+    pairs += [pair for name in rigs for pair in (("anny:man", name), (name, "anny:man"))]
+    console = Console(markup=False, emoji=False, highlight=False)
+    with console.status("") as status:
+        rows = run_suite(pairs, methods or tuple(METHODS), frames, tuple(seeds), say=status.update)
+    for key in ("ver", "ver_mouth", "ver_eyes", "ver_brows", "lips.contact_f1", "lids.blink_f1", "wmae", "jitter"):
+        console.print(f"\n{table(rows, key)}", soft_wrap=True)
+    for row in rows:
+        if row.failed:
+            console.print(f"{row.method}: {row.failed}", soft_wrap=True)
+    if json is not None:
+        write_atomically(json, dumps([asdict(row) for row in rows], indent=1).encode())
+
+
+def _moved(retargeter: Any, clip: str) -> Clip:
+    from reenact.rigs.files import load_clip
+
+    return retargeter(load_clip(clip, retargeter.source))
+
+
+def _geometric(
+    inputs: tuple[str, ...],
+    method: str,
+    source: str | None,
+    target: str | None,
+    pairs: Path | None,
+    training: str | None,
+    reverse: bool,
+) -> tuple[Clip, Any, list[str]]:
+    """A clip moved by a geometric method, the retargeter, and where the two rigs came from."""
+    from reenact.retargeting import METHODS
+    from reenact.retargeting.correspondence import find_correspondence, load_correspondence
+    from reenact.rigs.files import load_clip, load_rig
+
+    if method not in METHODS:
+        raise ReenactError(f"--method: expected one of {', '.join(METHODS)}, got {method}")
+    if len(inputs) == 2:
+        if source is not None or target is not None:
+            raise ReenactError("infer: expected either a RUN or --source and --target, got both")
+        saved = load_config(_run_config(inputs[0]))
+        source, target = saved.source, saved.target
+    if len(inputs) not in (1, 2) or target is None:
+        raise ReenactError(
+            f"infer: expected CLIP with --source and --target, or RUN and CLIP, beside --method; got "
+            f"{len(inputs)} arguments, --source {source or 'not given'}, --target {target or 'not given'}"
+        )
+    if source is None:
+        return _captured(inputs[-1], method, target, pairs, training)
+    names = [target, source] if reverse else [source, target]
+    rigs = [load_rig(name) for name in names]
+    console = Console(stderr=True)
+    found = None
+    if method not in ("copy", "neutral"):
+        with console.status("Finding the correspondence"):
+            found = find_correspondence(*rigs, 300) if pairs is None else load_correspondence(pairs, *rigs)
+    with console.status(f"Preparing {method}"):
+        shown = None if training is None else load_clip(training, rigs[0])
+        retargeter = METHODS[method](*rigs, found, shown)
+    return _moved(retargeter, inputs[-1]), retargeter, names
+
+
+def _captured(
+    take: str, method: str, target: str, places: Path | None, training: str | None
+) -> tuple[Clip, Any, list[str]]:
+    """A clip from markers, with what stands for a retargeter: the names to print."""
+    from types import SimpleNamespace
+
+    from reenact.retargeting.capture import drive, load_places
+    from reenact.retargeting.markers import load_markers
+    from reenact.rigs.files import load_rig
+
+    presets = {"ribera-paper": "paper", "ribera-robust": "robust", "quantile": "quantile", "residual": "residual"}
+    if method not in presets:
+        raise ReenactError(f"--method: expected one of {', '.join(presets)} for markers without --source, got {method}")
+    if places is None:
+        raise ReenactError("infer: expected --correspondence beside markers, a .csv of marker and vertex; got none")
+    rig = load_rig(target)
+    names, vertices = load_places(places, rig)
+    shown = None if training is None else load_markers(training)
+    clip = drive(rig, load_markers(take), names, vertices, presets[method], shown)
+    return clip, SimpleNamespace(source=SimpleNamespace(name=f"{len(names)} markers"), target=rig), [take, target]
 
 
 def _infer_defaults(arguments: list[str]) -> PostConfig:

@@ -292,14 +292,16 @@ def true_weights(
 
     Between rigs that share names the same shapes get the same weights. A merged character (`anny:merged`) shares names
     but not ranges, and stands for the full set that it was made from by a known matrix: from it the weights are those
-    of the full set, to it they are the bounded least-squares fit to the full set's vertices.
+    of the full set, to it they are the bounded least-squares fit to the full set's vertices. So it is for a built-in
+    character with other shapes altogether (`anny:units`): its own head with ARKit's shapes says what it should do.
 
     Returns:
         The source's weights with every shape at rest whose meaning the target does not know; the target's weights;
         and the indices of the target's shapes that the truth covers, none where the rigs share no name.
     """
     full_source, source_matrix = _unmerged(source)
-    full_target, _ = _unmerged(target)
+    full_target = _in_arkit(target) if common_shapes(full_source.names, target.names) == ([], []) else target
+    full_target = full_target if full_target is not target else _unmerged(target)[0]
     here, there = common_shapes(full_source.names, full_target.names)
     partnered = torch.zeros(len(full_source.names), dtype=torch.bool)
     partnered[here] = True
@@ -310,6 +312,13 @@ def true_weights(
     if full_target is target:
         return known, truth.clamp(0, 1), there
     return known, _fit(full_target, truth, target), list(range(len(target.names))) if there else []
+
+
+def _in_arkit(rig: Rig) -> Rig:
+    """The head of a built-in character with ARKit's shapes; other rigs as they are."""
+    from reenact.rigs import anny
+
+    return anny.with_arkit_shapes(rig.name) if rig.name in anny.CAST else rig
 
 
 def _unmerged(rig: Rig) -> tuple[Rig, Tensor]:
@@ -552,10 +561,10 @@ def evaluate_retargeters(
             "mean_pose": truth.mean(0).expand_as(truth),
             "shuffled": truth[order],
         }
-        contacts = _contacts(target)
+        contacts = contacts_of(target)
         true = {
             name: {
-                kind: _true(target, answer, truth, covered, span, list(kinds.values()), contacts)
+                kind: true_numbers(target, answer, truth, covered, span, list(kinds.values()), contacts)
                 for kind, span in _spans(kinds)
             }
             for name, answer in answers.items()
@@ -689,7 +698,7 @@ def _cyclic(
     }
 
 
-def _true(
+def true_numbers(
     target: Rig,
     predicted: Tensor,
     truth: Tensor,
@@ -698,6 +707,17 @@ def _true(
     clips: list[slice],
     contacts: dict[str, Tensor],
 ) -> dict[str, Any]:
+    """The numbers against the truth: VER with its interval, the weights', and of lids and lips where they are known.
+
+    Args:
+        target: Whose weights.
+        predicted: (T, K).
+        truth: (T, K).
+        shared: Shapes that the truth covers; only they count in the weights' numbers.
+        span: Frames to count.
+        clips: Spans of the clips, for what must not look across their borders.
+        contacts: From `contacts_of`.
+    """
     inside = [clip for clip in clips if span.start is None or clip == span]
     predicted_span, truth_span = predicted[span], truth[span]
     error, motion = vertex_errors(target, predicted_span, truth_span)
@@ -717,7 +737,7 @@ def _true(
     return numbers
 
 
-def _contacts(rig: Rig) -> dict[str, Tensor]:
+def contacts_of(rig: Rig) -> dict[str, Tensor]:
     """Pairs of vertices that meet when lids and lips close, where they are known."""
     if not rig.name.startswith("anny:"):
         return {}

@@ -333,6 +333,19 @@ def before_merging(name: str = "anny:merged") -> Rig:
     return _cached(name, "full", lambda: _assemble(name, CAST[name]))
 
 
+def with_arkit_shapes(name: str) -> Rig:
+    """The head of a built-in character with all 52 ARKit shapes, whatever shapes it has itself: what it should do.
+
+    Raises:
+        ReenactError: There is no such character.
+    """
+    if name not in CAST:
+        raise ReenactError(f"{name}: expected a built-in character, one of {', '.join(CAST)}")
+    if CAST[name].units == "arkit" and not CAST[name].merged:
+        return build(name)
+    return _cached(name, "full", lambda: _assemble(name, replace(CAST[name], units="arkit")))
+
+
 def merged_matrix() -> tuple[tuple[str, ...], tuple[str, ...], Float[Tensor, "K_full K_merged"]]:
     """Names before and after merging, and the matrix M with full weights = M merged weights."""
     full = tuple(_read_units("arkit"))
