@@ -66,7 +66,7 @@ def test_help_names_every_command(capsys):
             "infer",
             ["RUN", "CLIP", "--out FILE", "--reverse", "--fps", "--post.gain", "Live Link Face"],
         ),
-        ("evaluate", ["evaluate [-h] RUN [RUN ...]", "--frames INT", "--seed INT", "(one or more)"]),
+        ("evaluate", ["[RUN ...]", "--frames INT", "--seed INT", "--suite", "--methods NAME"]),
         ("convert", ["IN", "OUT", "--rig RIG", "--parts NAME", "--fps", "--post.smooth FLOAT"]),
         ("inspect", ["--out FILE.png", "--json FILE.json", "--parts NAME", "looks wrong"]),
         ("rigs", ["--out FILE.png", "--size INT"]),
@@ -394,3 +394,63 @@ def test_inspect_of_what_is_no_rig_is_one_sentence(tmp_path, capsys):
     (tmp_path / "x.glb").write_bytes(b"glTF")
     assert "expected a GLB file" in fails(capsys, "inspect", tmp_path / "x.glb")
     assert "expected 16 to 1024 pixels" in fails(capsys, "inspect", "anny:man", "--size", 3)
+
+
+def test_a_geometric_method_needs_no_run(tmp_path, toy_pair, capsys):
+    names = []
+    for rig in toy_pair:
+        names.append(f"{tmp_path / rig.name}.npz")
+        save_rig(rig, names[-1])
+    rigs = ["--source", names[0], "--target", names[1]]
+    (tmp_path / "pairs.csv").write_text("source,target\n" + "".join(f"{v},{v}\n" for v in range(0, 642, 2)))
+    out = tmp_path / "c.npz"
+    arguments = ["infer", "synthetic:3:2", "--method", "rbf", *rigs, "--correspondence", f"{tmp_path / 'pairs.csv'}"]
+    assert main([*arguments, "--out", f"{out}"]) == 0
+    assert "60 frames, 2.0 s, ball -> egg" in capsys.readouterr().out
+    moved, truth = load_clip(str(out), toy_pair[1]), load_clip("synthetic:3:2", toy_pair[0])
+    assert float((moved.weights - truth.weights).abs().mean()) < 0.1
+    assert "expected one of neutral, copy" in fails(capsys, "infer", "c.csv", "--method", "magic", *rigs, "--out", out)
+    assert "expected CLIP with --source and --target" in fails(
+        capsys, "infer", "c.csv", "--method", "rbf", "--out", out
+    )
+    assert "expected --method beside --source, --target" in fails(
+        capsys, "infer", tmp_path, "c.csv", *rigs, "--out", out
+    )
+    assert "expected RUN and CLIP, got 1" in fails(capsys, "infer", "c.csv", "--out", out)
+
+
+def test_markers_drive_a_rig_without_a_source(tmp_path, toy_rig, capsys):
+    import numpy as np
+
+    from reenact.retargeting.correspondence import Places
+    from reenact.retargeting.markers import Markers
+
+    save_rig(toy_rig, tmp_path / "ball.npz")
+    chosen = torch.arange(0, 642, 9)
+    clip = load_clip("synthetic:3:10", toy_rig)
+    take = Markers.from_rig(toy_rig, Places.at(chosen), clip.weights, 30.0)
+    np.savez(tmp_path / "take.npz", positions=take.positions.numpy(), names=np.array(take.names), fps=30.0)
+    rows = [f"{name},{vertex}" for name, vertex in zip(take.names, chosen.tolist())]
+    (tmp_path / "places.csv").write_text("\n".join(["marker,vertex", *rows]))
+    arguments = ["infer", f"{tmp_path / 'take.npz'}", "--method", "quantile", "--target", f"{tmp_path / 'ball.npz'}"]
+    arguments += ["--out", f"{tmp_path / 'c.npz'}"]
+    assert "expected --correspondence beside markers" in fails(capsys, *arguments)
+    assert main([*arguments, "--correspondence", f"{tmp_path / 'places.csv'}"]) == 0
+    moved = load_clip(str(tmp_path / "c.npz"), toy_rig)
+    assert float((moved.weights - clip.weights).abs().mean()) < 0.1
+
+
+def test_the_suite_prints_a_table_of_methods(capsys, monkeypatch, tmp_path):
+    from reenact import suite
+
+    monkeypatch.setattr(suite, "TARGETS", ("anny:woman",))
+    monkeypatch.setattr(suite, "find_correspondence", lambda *_: None)
+    out = tmp_path / "rows.json"
+    arguments = ["evaluate", "--suite", "geometric", "--methods", "copy", "neutral", "rbf", "--frames", "36"]
+    assert main([*arguments, "--seeds", "2", "--json", f"{out}"]) == 0
+    text = capsys.readouterr().out
+    assert "| copy | 0.000 ± 0.000 |" in text  # the same names and the same ranges
+    assert "| neutral | 1.000 ± 0.000 |" in text
+    assert "rbf: anny:man to anny:woman: proportion matching needs a correspondence" in text
+    assert len(out.read_text()) > 100
+    assert "expected methods among" in fails(capsys, "evaluate", "--suite", "geometric", "--methods", "magic")
