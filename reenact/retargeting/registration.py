@@ -21,7 +21,7 @@ features          (N, D) how the shapes move each vertex, see `_features`
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -50,10 +50,9 @@ _FLOOR = 0.003
 _DIMENSIONS = 80
 """Principal components that the motion of all shapes is reduced to."""
 _NORMAL_WEIGHT = 6.0
+"""A turn by 10 degrees counts as much as one standard deviation of the position."""
 _SCALES = (0.1, 0.2, 0.2, 0.2, 0.15, 0.1, 0.07, 0.05, 0.04, 0.03, 0.03)
 """Standard deviation of a partner's position, coarse to fine, in face heights."""
-_COARSE_SCALES = (0.1, 0.2, 0.15, 0.1)
-_COARSE_BENDING = (1e-1, 1e-2)
 _BELIEF = 1.5
 """What disagreement of motion as large as usual counts, in standard deviations of the position."""
 _DISAGREEMENT = 0.02
@@ -61,12 +60,18 @@ _DISAGREEMENT = 0.02
 sculptor it is 0.002 to 0.006, between heads of two 0.06 to 0.07."""
 _BENDING = (1e-1, 5e-3)
 """Weight of the bending energy of the deformation, first and last; the published schemes also loosen as they go."""
-_SETTLING = 1e-7
-"""The same for the last step, which lets sure pairs correct unsure ones between them."""
-_DRIFT = 0.15
-"""By how much a pair is off per distance from the next landmark; measured."""
+_COARSE_SCALES, _COARSE_BENDING = (0.1, 0.2, 0.15, 0.1), (1e-1, 1e-2)
+"""The same for the rounds that only ask which shape is which."""
 _FEATURE_BENDING = 1e-4
 """The same for the slowly changing difference between both rigs' motion."""
+_SETTLING = 1e-7
+"""The same for the last step, which lets sure pairs correct unsure ones between them."""
+_CONTRADICTION = 0.06
+"""Distance in face heights beyond which two answers are not averaged."""
+_LEAST = 1e-3
+"""Face heights that no pair is expected to be surer than."""
+_DRIFT = 0.15
+"""By how much a pair is off per distance from the next landmark: 0.06 to 0.25 on the built-in heads."""
 
 
 @dataclass(frozen=True)
@@ -307,17 +312,14 @@ def register(source: Rig, target: Rig, use_names: bool = True) -> Registration:
         for _ in range(2):
             _need(source, target, pairs)
             start = _centres_aligned(*faces, pairs)
-            match, _ = _match(*faces, pairs, start, _COARSE_SCALES, _COARSE_BENDING)
+            match = _match(*faces, pairs, start, _COARSE_SCALES, _COARSE_BENDING)
             pairs = _moving(*faces, _pairs_by_motion(*faces, start.rotation, match))
     _need(source, target, pairs)
     start = _centres_aligned(*faces, pairs)
-    there, slide = _match(*faces, pairs, start, _SCALES, _BENDING)
+    there = _match(*faces, pairs, start, _SCALES, _BENDING)
     swapped = tuple((theirs, ours) for ours, theirs in pairs)
-    back, _ = _match(*faces[::-1], swapped, _centres_aligned(*faces[::-1], swapped), _SCALES, _BENDING)
-    partners, gap = _halfway(*faces, there, back)
-    # What both directions make of a place, and how far motion lets it slide: off by either where the other is small, it
-    # is off by their geometric mean, as measured where the truth is known.
-    error = np.sqrt((gap + 1e-3) * (slide + 1e-3))
+    back = _match(*faces[::-1], swapped, _centres_aligned(*faces[::-1], swapped), _SCALES, _BENDING)
+    partners, error = _agreed(*faces, there, back)
     rest = start(faces[0].points)
     trust = np.minimum(np.square(0.01 / error), 10)
     settled = rest + _Smoother(faces[0])(partners - rest, trust, _SETTLING)  # the sure places hold the others
@@ -408,7 +410,7 @@ def confidence(error: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
     Errors are spread about what is expected of them by a factor of 2 or so, hence the slope of the logistic curve. It
     was read off seven pairs of heads whose vertices are known to correspond: man, woman, child, toon and others.
     """
-    return 1 / (1 + (error / 0.014) ** 2)
+    return 1 / (1 + (error / 0.0115) ** 2)
 
 
 def complete(
@@ -479,6 +481,9 @@ class _Match:
     shares: Float[np.ndarray, "N 3"]
     distance: Float[np.ndarray, "N"]
     """Between vertex and partner in the common space."""
+    slide: Float[np.ndarray, "N"]
+    """How far the partner could slide along the target before normals and motion would disagree by as much again as
+    they do, face heights."""
 
     def of(self, values: Float[np.ndarray, "M D"]) -> Float[np.ndarray, "N D"]:
         """Values of the target's vertices at the partners."""
@@ -492,13 +497,8 @@ def _match(
     start: _Similarity,
     scales: tuple[float, ...],
     bending: tuple[float, float],
-) -> tuple[_Match, Float[np.ndarray, "N"]]:
-    """Partners by turns: closest points in the common space, then the least bent deformation that follows them.
-
-    Returns:
-        The partners, and how far they could slide before normals and motion would disagree by as much again as they do,
-        in face heights.
-    """
+) -> _Match:
+    """Partners by turns: closest points in the common space, then the least bent deformation that follows them."""
     ours, theirs = _features(source, target, pairs, start.rotation)
     original, rest = ours, start(source.points)
     points, normals = rest, source.normals @ start.rotation.T
@@ -519,7 +519,7 @@ def _match(
         metric = _metric(ours - features, trust * source.areas, spread)
     match = search(points, normals, ours, scales[-1], metric)
     sharpness = _sharpness(target, np.concatenate([target.normals * _NORMAL_WEIGHT, theirs @ metric], 1))
-    return match, match.distance / match.of(sharpness[:, None])[:, 0].clip(1)
+    return replace(match, slide=match.distance / match.of(sharpness[:, None])[:, 0].clip(1))
 
 
 class _Search:
@@ -537,7 +537,7 @@ class _Search:
         queries = np.concatenate([points / unit, normals * _NORMAL_WEIGHT, features @ metric], 1)
         corners, shares = _closest(queries, places, target.faces)
         offsets = np.einsum("nci,nc->ni", places[corners], shares) - queries
-        return _Match(corners, shares, np.linalg.norm(offsets, axis=1))
+        return _Match(corners, shares, np.linalg.norm(offsets, axis=1), np.zeros(len(queries)))
 
 
 def _closest(queries: np.ndarray, places: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -597,23 +597,29 @@ def _metric(difference: Float[np.ndarray, "N D"], weights: Float[np.ndarray, "N"
     return belief / np.sqrt(size) * vectors @ np.diag(values.clip(1e-12) ** -0.5) @ vectors.T
 
 
-def _halfway(
+def _agreed(
     source: Face, target: Face, there: _Match, back: _Match
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N"]]:
-    """Points halfway between the partners found from the source and those that found their way back to it.
+    """Points between the partners found from the source and those that found their way back to it.
+
+    Each answer counts by how little it can slide: the inverse of its squared uncertainty.
 
     Returns:
-        The points, and how far both answers lie apart, in face heights.
+        The points, and how far off they are expected to be, in face heights: the geometric mean of how far both answers
+        lie apart and how far they can slide. Either may be small by chance or by mistake.
     """
     ahead = there.of(target.points)
     # Where each target vertex lies on the source; the place whose answer is the source's vertex is its other partner.
     landed = _placed(back.of(source.points), back.of(source.normals), source.height)
     corners, shares = _closest(_placed(source.points, source.normals, source.height), landed, target.faces)
     returned = np.einsum("nci,nc->ni", target.points[corners], shares)
+    slide, slide_back = there.slide, (back.slide[corners] * shares).sum(1)
     gap = np.linalg.norm(ahead - returned, axis=1) / target.height
-    # Halfway between answers that contradict each other lies nothing, or the other lid: the way there counts alone.
-    share = np.where(gap < 0.06, 0.5, 0.0)[:, None]
-    return ahead + share * (returned - ahead), gap
+    belief = slide**2 / (slide**2 + slide_back**2)  # in the way back
+    # Between answers that contradict each other lies nothing, or the other lid: one of them counts alone.
+    belief = np.where(gap < _CONTRADICTION, belief, np.round(belief))[:, None]
+    both = slide * slide_back / np.hypot(slide, slide_back)
+    return ahead + belief * (returned - ahead), np.sqrt((gap + _LEAST) * (both + _LEAST))
 
 
 def _onto(face: Face, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
