@@ -1,0 +1,80 @@
+"""The table of methods: what it measures is what it says."""
+
+import pytest
+import torch
+
+from reenact import suite
+from reenact.errors import ReenactError
+from reenact.evaluation import common_shapes, true_weights, vertex_error_ratio
+from reenact.retargeting.correspondence import Correspondence
+from reenact.rigs import anny
+from reenact.rigs.files import load_rig
+from reenact.suite import Row, region_vertices, run_suite, table
+
+
+@pytest.fixture(scope="module")
+def man():
+    return load_rig("anny:man")
+
+
+def test_regions_are_where_lips_lids_and_brows_are(man):
+    regions = region_vertices(man)
+    assert set(regions) == {"mouth", "eyes", "brows"}
+    heights = {name: float(man.neutral[vertices, 1].mean()) for name, vertices in regions.items()}
+    assert heights["mouth"] < heights["eyes"] < heights["brows"]
+    for part, region in (("lips", "mouth"), ("lashes", "eyes"), ("brows", "brows")):
+        inside = torch.isin(man.part(part), regions[region]).float().mean()
+        assert inside > 0.8, part
+
+
+def test_a_rig_of_other_shapes_has_the_truth_of_its_own_head_with_arkit_shapes(man):
+    units = load_rig("anny:units")
+    assert common_shapes(man.names, units.names) == ([], [])
+    weights = torch.zeros(1, 52)
+    weights[0, man.names.index("jawOpen")] = 1
+    known, truth, shared = true_weights(man, units, weights)
+    assert torch.equal(known, weights)
+    assert shared == list(range(34))
+    head = anny.with_arkit_shapes("anny:units")
+    assert torch.equal(head.neutral, units.neutral)
+    wanted = head.vertices(weights) - head.neutral
+    missed = units.vertices(truth) - units.neutral - wanted
+    assert missed.norm() < 0.6 * wanted.norm()  # 34 other shapes come half as near
+
+
+def test_methods_are_measured_on_every_pair_and_a_failure_is_a_row(monkeypatch):
+    pairs = Correspondence.identity(load_rig("anny:man"), load_rig("anny:woman"))
+    chosen = pairs[torch.arange(0, len(pairs), 40)]
+    monkeypatch.setattr(suite, "find_correspondence", lambda *_: chosen)
+    rows = run_suite([("anny:man", "anny:woman"), ("anny:man", "anny:units")], ("copy", "rbf"), frames=36, seeds=(0, 1))
+    assert len(rows) == 8
+    by = {(row.target, row.method, row.seed): row for row in rows}
+    assert by["anny:woman", "copy", 0].numbers["ver"] == 0
+    assert 0 < by["anny:woman", "rbf", 1].numbers["ver"] < 0.6
+    assert "none of its 52 shapes" in by["anny:units", "copy", 0].failed
+    assert by["anny:units", "copy", 0].numbers == {}
+    with pytest.raises(ReenactError, match="expected methods among"):
+        run_suite([("anny:man", "anny:woman")], ("magic",))
+
+
+def test_regional_errors_are_the_error_over_those_vertices(man):
+    truth = torch.zeros(2, 52)
+    truth[:, man.names.index("jawOpen")] = 1
+    predicted = truth / 2
+    vertices = region_vertices(man)["mouth"]
+    assert suite._ratio_at(man, predicted, truth, vertices) == pytest.approx(0.5)
+    assert vertex_error_ratio(man, predicted, truth) == pytest.approx(0.5)
+
+
+def test_a_table_has_means_and_spreads_and_dashes():
+    rows = [
+        Row("a", "anny:b", "x", seed, 0.0, {"ver": value, "lips": {"f1": 1.0}}) for seed, value in enumerate((0.1, 0.3))
+    ]
+    rows.append(Row("a", "anny:b", "y", 0, 0.0, {}, "no"))
+    assert table(rows).splitlines() == [
+        "| ver | a to b |",
+        "|---|---|",
+        "| x | 0.200 ± 0.100 |",
+        "| y | - |",
+    ]
+    assert "| x | 1.000 ± 0.000 |" in table(rows, "lips.f1")
