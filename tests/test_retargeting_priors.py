@@ -1,14 +1,20 @@
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
+from conftest import make_toy_rig
 
 from reenact.errors import ReenactError
+from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.inverse_rig import InverseRig
+from reenact.retargeting.penalised_matching import PRIORS, PenalisedMatching
 from reenact.retargeting.priors import elastic_net, pca_prior, ridge_weights
+from reenact.retargeting.rbf import ProportionMatching
 from reenact.rigs import motion
+from reenact.rigs.clip import Clip
 
 
 @pytest.fixture(scope="module")
@@ -100,3 +106,34 @@ def test_unusable_input_is_named(toy_rig):
         elastic_net(torch.eye(2), torch.ones(1, 2), squares=-1.0)
     with pytest.raises(ReenactError, match="mirror each other"):
         elastic_net(torch.eye(2), torch.ones(1, 2), low=-2.0, high=1.0)
+
+
+@pytest.mark.parametrize("prior", PRIORS)
+def test_more_penalty_never_moves_the_face_more(prior):
+    ball, egg = make_toy_rig("ball"), make_toy_rig("egg", stretch=1.25)
+    pairs = Correspondence.identity(ball, egg)
+    clip = Clip(ball.names, motion.expressions(ball.names, 50, seed=1), 30.0)
+    moved = []
+    for factor in (0.0, 0.1, 1.0, 10.0):
+        method = PenalisedMatching(ball, egg, pairs, prior=prior, strength=0.1 * factor, sparsity=0.05 * factor)
+        weights = method(clip).weights
+        moved.append(float((egg.vertices(weights) - egg.neutral).norm()))
+    assert all(later <= earlier * (1 + 1e-6) for earlier, later in pairwise(moved))
+    assert moved[3] < 0.7 * moved[0]
+
+
+def test_no_penalty_is_proportion_matching():
+    ball, egg = make_toy_rig("ball"), make_toy_rig("egg", stretch=1.25)
+    pairs = Correspondence.identity(ball, egg)
+    clip = Clip(ball.names, motion.expressions(ball.names, 20, seed=1), 30.0)
+    plain = ProportionMatching(ball, egg, pairs)(clip).weights
+    for prior in PRIORS:
+        same = PenalisedMatching(ball, egg, pairs, prior=prior, strength=0.0, sparsity=0.0)(clip).weights
+        torch.testing.assert_close(same, plain, rtol=0, atol=1e-5)  # float32 of an exact solve
+
+
+@pytest.mark.parametrize("settings", [{"prior": "magic"}, {"strength": -1.0}, {"sparsity": -1.0}])
+def test_penalties_that_cannot_be_are_refused(settings):
+    ball = make_toy_rig("ball")
+    with pytest.raises(ReenactError, match="penalised matching: expected"):
+        PenalisedMatching(ball, ball, Correspondence.identity(ball, ball), **settings)

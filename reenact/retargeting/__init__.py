@@ -9,6 +9,7 @@ from reenact.retargeting.delta_transfer import DeltaTransfer
 from reenact.retargeting.facial_rigging import FacialRigging
 from reenact.retargeting.key_shapes import KeyShapes
 from reenact.retargeting.manifold_alignment import ManifoldAlignment
+from reenact.retargeting.penalised_matching import PenalisedMatching
 from reenact.retargeting.rbf import ProportionMatching
 from reenact.retargeting.retargeter import Retargeter
 from reenact.retargeting.shape_matching import ShapeMatching
@@ -26,6 +27,9 @@ METHODS: dict[str, Callable[..., Retargeter]] = {
     "kernel-cca": KernelCCA,
     "velocity": VelocityMatching,
     "rbf": ProportionMatching,
+    "rbf-l2": partial(PenalisedMatching, prior="l2"),
+    "rbf-elastic-net": partial(PenalisedMatching, prior="elastic-net"),
+    "rbf-pca": partial(PenalisedMatching, prior="pca"),
     "ribera-paper": partial(ManifoldAlignment, preset="paper"),
     "ribera-robust": partial(ManifoldAlignment, preset="robust"),
     "quantile": partial(ManifoldAlignment, preset="quantile"),

@@ -210,11 +210,11 @@ class ProportionMatching:
         self.carried = carry_shapes(source, target, correspondence, linearised, stiffness)
         weighted = self.carried.guess * self.carried.confidence[:, None]
         self.gram = torch.einsum("kni,lni->kl", weighted, self.carried.guess)  # H
-        self._projection = torch.einsum("sni,kni->sk", self.carried.source_shapes, weighted)  # (Ks, Kt)
+        self.source_projection = torch.einsum("sni,kni->sk", self.carried.source_shapes, weighted)  # (Ks, Kt)
 
     def __call__(self, clip: Clip) -> Clip:
         """The clip on the target, weights in [0, 1]."""
         check_names(clip, self.source)
-        projections = clip.weights.to(torch.float64) @ self._projection - self.sparsity * self.gram.diagonal()
+        projections = clip.weights.to(torch.float64) @ self.source_projection - self.sparsity * self.gram.diagonal()
         weights = nonnegative_least_squares(self.gram, projections, high=1.0)
         return replace(clip, names=self.target.names, weights=weights.float())
