@@ -150,7 +150,7 @@ def test_lids_lips_and_nose_of_another_topology_are_found(man):
         ours = man.deltas[man.names.index(f"eyeBlink{side}")][at, 1]
         theirs = found.target.of(other.deltas[other.names.index(blink)])[:, 1]
         lid = ours < 0.7 * ours.min()
-        assert (theirs[lid] < 0.3 * theirs.min()).float().mean() > 0.65  # its underside has no partner on the ICT face
+        assert (theirs[lid] < 0.3 * theirs.min()).float().mean() > 0.8  # measured: 0.93 and 0.83
     # What the jaw carries stays apart from what it leaves.
     ours = man.deltas[man.names.index("jawOpen")][at].norm(dim=1)
     theirs = found.target.of(other.deltas[other.names.index("jawOpen")]).norm(dim=1)
