@@ -119,7 +119,7 @@ def test_more_penalty_never_moves_the_face_more(prior):
         weights = method(clip).weights
         moved.append(float((egg.vertices(weights) - egg.neutral).norm()))
     assert all(later <= earlier * (1 + 1e-6) for earlier, later in pairwise(moved))
-    assert moved[3] < 0.7 * moved[0]
+    assert moved[3] < 0.8 * moved[0]
 
 
 def test_no_penalty_is_proportion_matching():

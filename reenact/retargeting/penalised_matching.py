@@ -1,7 +1,7 @@
 """Proportion matching with a penalty on weights: the peers that Ribera 2017 compares its geometric prior with.
 
-Ribera et al. 2017, "Facial Retargeting with Automatic Range of Motion Alignment", doi:10.1145/3072959.3073674, Sec. 6.2:
-the thin-plate guess as personal shapes, and in Eq. 16 another norm in the place of E_Prior.
+Ribera et al. 2017, "Facial Retargeting with Automatic Range of Motion Alignment", doi:10.1145/3072959.3073674, Sec.
+6.2: the thin-plate guess as personal shapes, and in Eq. 16 another norm in the place of E_Prior.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class PenalisedMatching:
         Raises:
             ReenactError: No correspondence, an unknown prior, or a negative strength.
 
-        Source: RB17, Eq. 16. The bounds, the units of the strengths, and that the PCA prior is centred on the neutral, so
-        that a still face stays still, are ours.
+        Source: RB17, Eq. 16. The bounds, the units of the strengths, and that the PCA prior is centred on the neutral,
+        so that a still face stays still, are ours.
         """
         if prior not in PRIORS:
             raise ReenactError(f"penalised matching: expected a prior among {', '.join(PRIORS)}, got {prior}")
