@@ -485,7 +485,7 @@ def test_numbers_that_json_cannot_hold_become_null():
 
 def test_contacts_are_scored_where_they_are_known(rigs, monkeypatch):
     pairs = {key: torch.tensor([[2 * i, 2 * i + 1]]) for i, key in enumerate(("lids_left", "lids_right", "lips"))}
-    monkeypatch.setattr(evaluation, "_contacts", lambda rig: pairs)
+    monkeypatch.setattr(evaluation, "contacts_of", lambda rig: pairs)
     truth = run(rigs, copy, frames=18)[0]["truth"]
     assert truth["lids"] == {"error": 0, "blink_f1": 1, "blinks": 0}
     assert truth["lips"] == {"gap_error": 0, "contact_f1": 1, "contacts": truth["lips"]["contacts"]}
