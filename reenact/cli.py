@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from reenact.inspection import Inspection
     from reenact.rigs.clip import Clip
     from reenact.rigs.formats.pieces import Choice
+    from reenact.rigs.rig import Rig
 
 _USD_FILES = (".usd", ".usda", ".usdc", ".usdz")
 _RIG_FILES = (".glb", ".npz", ".obj", *_USD_FILES)
@@ -406,13 +407,17 @@ def _geometric(
     from reenact.retargeting.correspondence import find_correspondence, load_correspondence
     from reenact.rigs.files import load_clip, load_rig
 
+    rigs: list[Rig] = []
     if method not in METHODS:
         raise ReenactError(f"--method: expected one of {', '.join(METHODS)}, got {method}")
     if len(inputs) == 2:
         if source is not None or target is not None:
             raise ReenactError("infer: expected either a RUN or --source and --target, got both")
-        saved = load_config(_run_config(inputs[0]))
-        source, target = saved.source, saved.target
+        _run_config(inputs[0])
+        from reenact.run import Run
+
+        run = Run.open(inputs[0])
+        source, target, rigs = run.config.source, run.config.target, list(run.rigs.values())[:2]
     if len(inputs) not in (1, 2) or target is None:
         raise ReenactError(
             f"infer: expected CLIP with --source and --target, or RUN and CLIP, beside --method; got "
@@ -420,8 +425,10 @@ def _geometric(
         )
     if source is None:
         return _captured(inputs[-1], method, target, pairs, training)
-    names = [target, source] if reverse else [source, target]
-    rigs = [load_rig(name) for name in names]
+    names = [source, target]
+    rigs = rigs or [load_rig(name) for name in names]
+    if reverse:
+        names, rigs = names[::-1], rigs[::-1]
     console = Console(stderr=True)
     found = None
     if method not in ("copy", "neutral"):

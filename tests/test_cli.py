@@ -454,3 +454,13 @@ def test_the_suite_prints_a_table_of_methods(capsys, monkeypatch, tmp_path):
     assert "rbf: anny:man to anny:woman: proportion matching needs a correspondence" in text
     assert len(out.read_text()) > 100
     assert "expected methods among" in fails(capsys, "evaluate", "--suite", "geometric", "--methods", "magic")
+
+
+def test_a_geometric_method_takes_the_rigs_of_a_run(tmp_path, toy_run, capsys):
+    out = tmp_path / "c.npz"
+    assert (
+        main(["infer", f"{toy_run.folder}", "synthetic:3:1", "--method", "copy", "--reverse", "--out", f"{out}"]) == 0
+    )
+    assert "egg -> ball" in capsys.readouterr().out
+    sentence = fails(capsys, "infer", toy_run.folder, "c.csv", "--method", "copy", "--source", "x", "--out", out)
+    assert "either a RUN or --source and --target" in sentence
