@@ -27,7 +27,8 @@ from torch import Tensor
 from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.rbf import ProportionMatching
-from reenact.retargeting.trivial import CopyNames, check_names
+from reenact.retargeting.retargeter import check_names
+from reenact.retargeting.trivial import CopyNames
 from reenact.rigs import arkit
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig

@@ -40,6 +40,7 @@ from reenact.geometry import (
 )
 from reenact.retargeting.correspondence import Correspondence, Places
 from reenact.retargeting.inverse_rig import InverseRig, nonnegative_least_squares
+from reenact.retargeting.retargeter import check_names
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
@@ -107,13 +108,13 @@ class DeformationTransfer:
 
     def __call__(self, clip: Clip) -> Clip:
         """The clip on the target: bounded least squares of `vertices(clip)`, weights in [0, 1]."""
-        check_names(self.source, clip)
+        check_names(clip, self.source)
         weights = self._explanation.weights(clip.weights.double() @ self._projection)
         return replace(clip, names=self.target.names, weights=weights.float())
 
     def vertices(self, clip: Clip) -> Float[Tensor, "T V 3"]:
         """Target vertices in metres, outside the span of the target's own shapes."""
-        check_names(self.source, clip)
+        check_names(clip, self.source)
         return self.shapes.vertices(clip.weights)
 
     def transfer(self, vertices: Float[Tensor, "T Vs 3"]) -> Float[Tensor, "T Vt 3"]:
@@ -144,11 +145,6 @@ class DeformationTransfer:
 
     def _carry(self, offsets: Tensor) -> Tensor:
         return apply_sparse(self._carried, offsets)
-
-
-def check_names(source: Rig, clip: Clip) -> None:
-    if clip.names != source.names:
-        raise ReenactError(f"clip: expected the {len(source.names)} shapes of {source.name}, in its order")
 
 
 def apply_sparse(matrix: csr_array, values: Float[Tensor, "T N C"]) -> Float[Tensor, "T M C"]:

@@ -28,11 +28,11 @@ from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import (
     Explanation,
     apply_sparse,
-    check_names,
     connected_pieces,
     densify,
     vertex_pairs,
 )
+from reenact.retargeting.retargeter import check_names
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
@@ -91,13 +91,13 @@ class DeltaTransfer:
 
     def __call__(self, clip: Clip) -> Clip:
         """The clip on the target: bounded least squares of `vertices(clip)`, weights in [0, 1]."""
-        check_names(self.source, clip)
+        check_names(clip, self.source)
         weights = self._explanation.weights(clip.weights.double() @ self._projection)
         return replace(clip, names=self.target.names, weights=weights.float())
 
     def vertices(self, clip: Clip) -> Float[Tensor, "T V 3"]:
         """Target vertices in metres, outside the span of the target's own shapes."""
-        check_names(self.source, clip)
+        check_names(clip, self.source)
         return self.shapes.vertices(clip.weights)
 
 

@@ -27,9 +27,10 @@ from torch import Tensor
 from reenact.errors import ReenactError
 from reenact.geometry import face_frames, farthest_points
 from reenact.retargeting.correspondence import Correspondence
-from reenact.retargeting.deformation_transfer import DeformationTransfer, check_names, densify
+from reenact.retargeting.deformation_transfer import DeformationTransfer, densify
 from reenact.retargeting.inverse_rig import InverseRig, nonnegative_least_squares
 from reenact.retargeting.rbf import carry_shapes
+from reenact.retargeting.retargeter import check_names
 from reenact.rigs import motion
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
@@ -97,7 +98,7 @@ class FacialRigging:
         if examples is None:
             if training is None:
                 training = motion.synthesize(source.names, 60.0, seed=0)
-            check_names(source, training)
+            check_names(training, source)
             examples = source.vertices(training.weights[choose_examples(source, training, config)])
         if examples.shape[1] != len(source.neutral):
             raise ReenactError(
@@ -122,7 +123,7 @@ class FacialRigging:
 
     def __call__(self, clip: Clip) -> Clip:
         """The clip on the target, weights in [0, 1]."""
-        check_names(self.source, clip)
+        check_names(clip, self.source)
         weights = nonnegative_least_squares(self._inverse.gram, clip.weights.double() @ self._projection, high=1.0)
         return replace(clip, names=self.target.names, weights=weights.float())
 

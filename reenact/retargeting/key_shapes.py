@@ -33,7 +33,8 @@ from reenact.geometry import farthest_points
 from reenact.retargeting.correspondence import Correspondence, Places
 from reenact.retargeting.inverse_rig import InverseRig, nonnegative_least_squares
 from reenact.retargeting.rbf import ProportionMatching
-from reenact.retargeting.trivial import CopyNames, check_names
+from reenact.retargeting.retargeter import check_names
+from reenact.retargeting.trivial import CopyNames
 from reenact.rigs import arkit, motion
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig

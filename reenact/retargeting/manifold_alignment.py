@@ -35,6 +35,7 @@ from reenact.retargeting.geometric_prior import FrameSolver, bending, sparsity_t
 from reenact.retargeting.marker_mesh import marker_mesh, surface_distances
 from reenact.retargeting.range_of_motion import RangeConfig, learn_range_of_motion
 from reenact.retargeting.rbf import carry_shapes
+from reenact.retargeting.retargeter import check_names
 from reenact.rigs import motion
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
@@ -435,10 +436,7 @@ class ManifoldAlignment:
 
     def __call__(self, clip: Clip) -> Clip:
         """The clip on the target; weights in [0, 1], but of any sign and size under `paper`, as published."""
-        if clip.names != self.source.names:
-            raise ReenactError(
-                f"clip: expected the {len(self.source.names)} shapes of {self.source.name}, in its order"
-            )
+        check_names(clip, self.source)
         weights = self.solver.solve(clip.weights.double() @ self._projection)
         return replace(clip, names=self.target.names, weights=weights.float())
 

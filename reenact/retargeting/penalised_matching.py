@@ -14,7 +14,7 @@ from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.priors import elastic_net, pca_prior
 from reenact.retargeting.rbf import ProportionMatching
-from reenact.retargeting.trivial import check_names
+from reenact.retargeting.retargeter import check_names
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 

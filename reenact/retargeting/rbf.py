@@ -24,7 +24,7 @@ from reenact.errors import ReenactError
 from reenact.geometry import similarity_fit
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.inverse_rig import nonnegative_least_squares
-from reenact.retargeting.trivial import check_names
+from reenact.retargeting.retargeter import check_names
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 

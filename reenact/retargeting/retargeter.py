@@ -7,6 +7,7 @@ from typing import Protocol
 from jaxtyping import Float
 from torch import Tensor
 
+from reenact.errors import ReenactError
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
@@ -28,3 +29,15 @@ class MeshRetargeter(Retargeter, Protocol):
     def vertices(self, clip: Clip) -> Float[Tensor, "T V 3"]:
         """Target vertices in metres, in the target's own frame; they need not lie in the span of its shapes."""
         ...
+
+
+def check_names(clip: Clip, source: Rig) -> None:
+    """
+    Raises:
+        ReenactError: The clip's names are not the rig's, in its order.
+    """
+    if clip.names != source.names:
+        raise ReenactError(
+            f"clip: expected the {len(source.names)} shapes of {source.name} in its order ({source.names[0]}, ...), "
+            f"got {len(clip.names)} ({', '.join(clip.names[:1])}, ...); use `reenact.rigs.files.conform`"
+        )

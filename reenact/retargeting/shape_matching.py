@@ -26,7 +26,7 @@ from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.inverse_rig import nonnegative_least_squares
 from reenact.retargeting.rbf import carry_shapes
-from reenact.retargeting.trivial import check_names
+from reenact.retargeting.retargeter import check_names
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 

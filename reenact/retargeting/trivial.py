@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import torch
 
-from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence
+from reenact.retargeting.retargeter import check_names
 from reenact.rigs.clip import Clip
 from reenact.rigs.files import conform
 from reenact.rigs.rig import Rig
@@ -58,15 +58,3 @@ class CopyNames:
         """The clip on the target, weights in [0, 1]."""
         check_names(clip, self.source)
         return replace(clip, names=self.target.names, weights=(clip.weights.float() @ self.matrix).clamp(0, 1))
-
-
-def check_names(clip: Clip, source: Rig) -> None:
-    """
-    Raises:
-        ReenactError: The clip's names are not the rig's, in its order.
-    """
-    if clip.names != source.names:
-        raise ReenactError(
-            f"clip: expected the {len(source.names)} shapes of {source.name} in its order ({source.names[0]}, ...), "
-            f"got {len(clip.names)} ({', '.join(clip.names[:1])}, ...); use `reenact.rigs.files.conform`"
-        )

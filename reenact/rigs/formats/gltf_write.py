@@ -20,6 +20,7 @@ from reenact.rigs.clip import Clip
 from reenact.rigs.formats import disk, gltf
 from reenact.rigs.formats.gltf_document import MESHOPT, Document, open_document
 from reenact.rigs.formats.pieces import to_linear
+from reenact.rigs.formats.polygons import vertex_normals
 from reenact.rigs.rig import PARTS, Rig
 
 
@@ -233,7 +234,7 @@ def _mesh(writer: _Writer, rig: Rig) -> dict[str, Any]:
         vertex, uv = pairs[:, 0], uv[pairs[:, 1]].astype(np.float32)
     attributes = {
         "POSITION": writer.accessor(neutral[vertex], "VEC3", 34962, bounds=True),
-        "NORMAL": writer.accessor(_normals(neutral, faces)[vertex], "VEC3", 34962),
+        "NORMAL": writer.accessor(vertex_normals(neutral, faces)[vertex], "VEC3", 34962),
     }
     if uv is not None:
         attributes["TEXCOORD_0"] = writer.accessor(uv, "VEC2", 34962)
@@ -253,14 +254,3 @@ def _mesh(writer: _Writer, rig: Rig) -> dict[str, Any]:
         "material": 0,
     }
     return {"name": rig.name, "primitives": [primitive], "weights": [0.0] * len(rig.names), "extras": extras}
-
-
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3), weighted by area; +Z where there is none."""
-    a, b, c = vertices[faces].astype(np.float64).transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    total = np.stack(
-        [np.bincount(faces.reshape(-1), np.repeat(normal[:, axis], 3), len(vertices)) for axis in range(3)], axis=1
-    )
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 1e-30, total / np.maximum(length, 1e-30), [0.0, 0.0, 1.0]).astype(np.float32)

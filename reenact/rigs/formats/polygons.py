@@ -243,3 +243,14 @@ def _check(where: Path, mesh: Mesh) -> None:
             raise ReenactError(f"{name}: a face names a {noun} that is not there")
     if mesh.colors is not None and len(mesh.colors) != count:
         raise ReenactError(f"{name}: expected {count} vertex colours, got {len(mesh.colors)}")
+
+
+def vertex_normals(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V 3"]:
+    """Unit normals, weighted by area; +Z where there is none. float32, for files."""
+    a, b, c = vertices[faces].astype(np.float64).transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    total = np.stack(
+        [np.bincount(faces.reshape(-1), np.repeat(normal[:, axis], 3), len(vertices)) for axis in range(3)], axis=1
+    )
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.where(length > 1e-30, total / np.maximum(length, 1e-30), [0.0, 0.0, 1.0]).astype(np.float32)

@@ -24,7 +24,7 @@ from reenact.errors import ReenactError
 from reenact.rigs.clip import Clip
 from reenact.rigs.formats import disk, isolated, pictures
 from reenact.rigs.formats.pieces import DEFAULT, Choice, Contents, assemble, to_linear
-from reenact.rigs.formats.polygons import Mesh, Surface, pieces_of
+from reenact.rigs.formats.polygons import Mesh, Surface, pieces_of, vertex_normals
 from reenact.rigs.rig import PARTS, Rig
 from reenact.rigs.timeline import steady
 
@@ -347,7 +347,7 @@ def _mesh(stage: Usd.Stage, rig: Rig) -> UsdGeom.Mesh:
     mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.stack([neutral.min(0), neutral.max(0)])))
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.reshape(-1)))
-    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(_normals(neutral, faces)))
+    mesh.CreateNormalsAttr(Vt.Vec3fArray.FromNumpy(vertex_normals(neutral, faces)))
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     primvars = UsdGeom.PrimvarsAPI(mesh)
     own = {"name": rig.name}
@@ -413,14 +413,3 @@ def _identifier(name: str, taken: set[str]) -> str:
         found = f"{base}_{number}"
     taken.add(found)
     return found
-
-
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Unit normals (V, 3), weighted by area; +Z where there is none."""
-    a, b, c = vertices[faces].astype(np.float64).transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    total = np.stack(
-        [np.bincount(faces.reshape(-1), np.repeat(normal[:, axis], 3), len(vertices)) for axis in range(3)], axis=1
-    )
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.where(length > 1e-30, total / np.maximum(length, 1e-30), [0.0, 0.0, 1.0]).astype(np.float32)
