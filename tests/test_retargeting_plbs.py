@@ -210,9 +210,22 @@ def test_patches_are_carried_to_another_mesh(toy_pair, examples, frames):
     torch.testing.assert_close(method(frames)[:, back], same(frames), rtol=0, atol=1e-9)
     # A vertex without partner belongs where its neighbour does.
     followed = csr_array(np.diag(np.r_[np.zeros(1), np.ones(641)]))
-    carried = same.patches.carried(source, followed)
+    carried = same.patches.carried(source, source, followed)
     nearest = torch.cdist(source.neutral[:1], source.neutral[1:]).argmin() + 1
     np.testing.assert_allclose(carried.shares[[0]].toarray(), carried.shares[[int(nearest)]].toarray())
+
+
+def test_pieces_without_pairs_keep_to_their_like(toy_rig):
+    """An eyeball in front of the face follows the source's eyeball, not the skin behind it."""
+    small = torch.cat([toy_rig.neutral * 0.1 + torch.tensor([x, 0.05, 0.12]) for x in (-0.04, 0.04)])
+    neutral = torch.cat([toy_rig.neutral, small])
+    faces = torch.cat([toy_rig.faces + 642 * piece for piece in range(3)])
+    rig = Rig("eyed", neutral, torch.zeros(1, len(neutral), 3), ("nod",), faces)
+    other = replace(rig, neutral=rig.neutral * 1.5)
+    pairs = csr_array((np.ones(642), (np.arange(642), np.arange(642))), shape=(len(neutral),) * 2)
+    patches = Patches.of(rig, 40)
+    carried = patches.carried(rig, other, pairs)
+    np.testing.assert_allclose(carried.shares.toarray(), patches.shares.toarray(), rtol=0, atol=1e-12)
 
 
 def test_a_still_clip_and_no_frames_are_fine(toy_pair, examples):

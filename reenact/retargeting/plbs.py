@@ -41,7 +41,7 @@ from torch import Tensor
 from reenact.errors import ReenactError
 from reenact.geometry import farthest_points
 from reenact.retargeting.correspondence import Correspondence
-from reenact.retargeting.deformation_transfer import apply_sparse, densify, vertex_pairs
+from reenact.retargeting.deformation_transfer import apply_sparse, connected_pieces, densify, vertex_pairs
 from reenact.rigs.rig import Rig
 
 try:
@@ -118,29 +118,39 @@ class Patches:
         ends = np.stack([labels[edges.coords[0]], labels[edges.coords[1]]], axis=1)
         return cls(_normalised(shares.tocsr()), np.unique(ends[ends[:, 0] < ends[:, 1]], axis=0))
 
-    def carried(self, target: Rig, pairs: csr_array) -> Patches:
+    def carried(self, source: Rig, target: Rig, pairs: csr_array) -> Patches:
         """The same patches on another mesh.
 
         Args:
-            target: That mesh.
-            pairs: (Vt, V) vertices that each vertex of it follows, as from `vertex_pairs`; rows without any take after
-                the nearest vertex that has one, along the surface or else through space.
+            source: Whose patches these are.
+            target: That other mesh.
+            pairs: (Vt, Vs) vertices that each vertex of it follows, as from `vertex_pairs`. Rows without any take after
+                the nearest vertex along the surface that has one. Pieces without any (eyeballs, teeth, tongue) look for
+                such pieces of the source, at the place beside the face where they are on the target.
         """
         shares = (pairs @ self.shares).tocsr()
-        paired = shares.sum(1) > 1e-6
-        points = target.neutral.double().numpy()
-        if not paired.all():
-            known = np.flatnonzero(paired)
-            distance, _, origin = dijkstra(
-                mesh_graph(target, bridges=False),
-                directed=False,
-                indices=known,
-                return_predecessors=True,
-                min_only=True,
-            )
-            beside = known[cKDTree(points[known]).query(points)[1]]
-            shares = shares[np.where(np.isfinite(distance), origin, beside)]
+        paired = np.flatnonzero(shares.sum(1) > 1e-6)
+        distance, _, origin = dijkstra(
+            mesh_graph(target, bridges=False), directed=False, indices=paired, return_predecessors=True, min_only=True
+        )
+        shares = shares[np.where(np.isfinite(distance), origin, paired[0])]
+        lost = np.flatnonzero(np.isinf(distance))
+        if len(lost):
+            here, there = target.neutral.double().numpy(), source.neutral.double().numpy()
+            beside = paired[cKDTree(here[paired]).query(here[lost])[1]]
+            follows = (diags_array(1 / pairs[paired].sum(1)) @ pairs[paired] @ there)[np.searchsorted(paired, beside)]
+            size = _spread(follows) / _spread(here[beside]) if _spread(here[beside]) > 0 else 1.0
+            pieces = connected_pieces(source.faces.numpy(), len(there))
+            alone = np.flatnonzero(~np.isin(pieces, pieces[pairs.tocoo().coords[1]]))
+            alone = alone if len(alone) else np.arange(len(there))
+            found = alone[cKDTree(there[alone]).query(follows + size * (here[lost] - here[beside]))[1]]
+            shares = shares.tolil()
+            shares[lost] = self.shares[found]
         return Patches(_normalised(shares.tocsr()), self.neighbours)
+
+
+def _spread(points: ndarray) -> float:
+    return float(np.linalg.norm(points - points.mean(0)))
 
 
 def _normalised(shares: csr_array) -> csr_array:
@@ -272,7 +282,7 @@ class PatchwiseBlendshapes:
         """The same on the target."""
         if correspondence is not None or not torch.equal(source.faces, target.faces):
             pairs = vertex_pairs(source, target, densify(source, target, correspondence), reach=0.05)
-            self.target_patches = self.patches.carried(target, pairs)
+            self.target_patches = self.patches.carried(source, target, pairs)
         self._source_neutral, self._target_neutral = source.neutral.double(), target.neutral.double()
         self._source_deltas = source_examples.double() - self._source_neutral
         self._target_deltas = target_examples.double() - self._target_neutral
