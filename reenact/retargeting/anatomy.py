@@ -35,7 +35,14 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reenact.errors import ReenactError
-from reenact.geometry import closest_points, cotangent_laplacian, farthest_points, rigid_fit, vertex_normals
+from reenact.geometry import (
+    closest_points,
+    closest_points_around,
+    cotangent_laplacian,
+    farthest_points,
+    rigid_fit,
+    vertex_normals,
+)
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import connected_pieces, vertex_pairs
 from reenact.retargeting.rbf import ThinPlate
@@ -138,7 +145,9 @@ class Landmarks:
         # Chin: moves far when the jaw opens, and little otherwise.
         others = np.square(np.delete(face.deltas, jaw_shape, 0)).sum((0, 2))
         telling = np.square(travel**2 / (travel**2 + 0.5 * others + 1e-12 * height**2)) * face.areas
-        chin = np.flatnonzero((travel > 0.7 * travel.max()) & (telling > 0.2 * telling[travel > 0.7 * travel.max()].max()))
+        chin = np.flatnonzero(
+            (travel > 0.7 * travel.max()) & (telling > 0.2 * telling[travel > 0.7 * travel.max()].max())
+        )
         middle = np.array([np.median(points[face.strength > 0.1, 0]), *points[chin].mean(0)[1:]])
         condyles = middle + np.array([[0.4, 0.32, -0.45], [-0.4, 0.32, -0.45]]) * height
         jaw_vertices, jaw_weights = face.vertices[chin], telling[chin] / telling[chin].sum()
@@ -192,7 +201,9 @@ def _pose(
     if condyles is not None:
         rest, moved = np.concatenate([rest, condyles]), np.concatenate([moved, condyles])
         weights = np.concatenate([weights, np.full(len(condyles), 0.15)])
-    rotation, translation = rigid_fit(*(torch.from_numpy(np.ascontiguousarray(each)) for each in (rest, moved, weights)))
+    rotation, translation = rigid_fit(
+        *(torch.from_numpy(np.ascontiguousarray(each)) for each in (rest, moved, weights))
+    )
     return rotation.numpy(), translation.numpy()
 
 
@@ -424,6 +435,24 @@ class Shell:
         ]
         return tuple(torch.from_numpy(np.stack(part)) for part in zip(*poses))
 
+    def head_pose(self, vertices: Float[Tensor, "T V 3"]) -> tuple[Float[Tensor, "T 3 3"], Float[Tensor, "T 3"]]:
+        """Rotation and translation of the head from rest, by the vertices that no shape moves; none where there are none.
+
+        A pose under a millionth of H is none: a still head stays exactly still.
+        """
+        self._check(vertices)
+        motion = self.rig.deltas.norm(dim=-1).amax(0)
+        still = (motion <= 1e-3 * motion.max()).nonzero().flatten()
+        rotations = torch.eye(3, dtype=torch.float64).repeat(len(vertices), 1, 1)
+        translations = torch.zeros(len(vertices), 3, dtype=torch.float64)
+        if len(still) < 12:
+            return rotations, translations
+        rest = self.rig.neutral[still].double()
+        for frame, mesh in enumerate(vertices[:, still].double()):
+            if float((mesh - rest).norm(dim=-1).max()) > 1e-6 * self.height:
+                rotations[frame], translations[frame] = rigid_fit(rest, mesh)
+        return rotations, translations
+
     def bones(self, vertices: Float[Tensor, "T V 3"]) -> Float[Tensor, "T X 3"]:
         """Where nodes are that bone or the border hold; the others at rest, carried along with the jaw by their share."""
         rotation, translation = self.jaw_pose(vertices)
@@ -583,44 +612,99 @@ def carry_shell(shell: Shell, rig: Rig, correspondence: Correspondence) -> Shell
         ReenactError: The shapes of the rig move no face, or the pairs do not spread over it.
     """
     marks = Landmarks.of(rig)
-    points = rig.neutral.double()
-    followed = vertex_pairs(rig, shell.rig, correspondence, 0.0)[shell.vertices.numpy()].tocsr()  # pairs, no reach
-    paired = np.flatnonzero(followed.sum(1) > 0.5)
-    if len(paired) < 8:
-        raise ReenactError(f"{rig.name}: expected at least 8 pairs on the face of {shell.rig.name}, got {len(paired)}")
-    own = shell.nodes[: len(shell)].numpy()
-    aims = (followed @ points.numpy())[paired]
-    chosen = farthest_points(torch.from_numpy(own[paired]), min(300, len(paired))).numpy()
-    plate = ThinPlate(torch.from_numpy(own[paired[chosen]]), torch.from_numpy(aims[chosen]), stiffness=1e-4)
+    own, count = shell.nodes[: len(shell)].numpy(), len(shell)
+    number = np.full(len(shell.rig.neutral), -1)
+    number[shell.vertices.numpy()] = np.arange(count)
+    corners, shares = number[correspondence.target.corners.numpy()], correspondence.target.shares.double().numpy()
+    confidence = correspondence.confidence.double().numpy()
+    used = np.flatnonzero(((corners >= 0) | (shares < 1e-6)).all(1) & (confidence > 0))
+    if len(used) < 8:
+        raise ReenactError(f"{rig.name}: expected at least 8 pairs on the face of {shell.rig.name}, got {len(used)}")
+    corners, shares, confidence = corners[used], shares[used], confidence[used]
+    places = coo_array(
+        (shares.ravel(), (np.repeat(np.arange(len(used)), 3), corners.clip(min=0).ravel())), shape=(len(used), count)
+    ).tocsr()
+    # Where tissue was smoothed under folded skin, it is so here.
+    eased = own - shell.rig.neutral.double().numpy()[shell.vertices.numpy()]
+    starts = places @ own
+    aims = correspondence.source.of(rig.neutral.double()).numpy()[used] + places @ eased
+    chosen = farthest_points(torch.from_numpy(starts), min(300, len(used)), torch.from_numpy(confidence)).numpy()
+    plate = ThinPlate(torch.from_numpy(starts[chosen]), torch.from_numpy(aims[chosen]), stiffness=1e-2)
     warped = plate(torch.from_numpy(own)).numpy()
-    bent = warped + _spread(shell, paired, aims - warped[paired])
-    scale = _local_scale(shell.skin_faces, own, bent)
-    layers, depth = _layers(rig, marks, bent, shell.skin_faces, shell.thickness * scale, shell.config)
-    sampler = _surface_sampler(marks.face, bent, shell.skin_faces, len(points))
-    # A pair says better where a vertex goes than the closest place does.
-    mixed = np.zeros(len(own))
-    mixed[paired] = 1.0
-    sampler = (diags_array(1 - mixed) @ sampler + diags_array(mixed) @ followed).tocsr()
+    for stiffness in _STIFFER:
+        bent = _bent(shell, warped, places, aims, confidence, stiffness)
+        nodes = _carried_layers(shell, bent)
+        if (tet_volumes(nodes, shell.tets) > 0).all():
+            break
+    followed = vertex_pairs(rig, shell.rig, correspondence, 0.1)[shell.vertices.numpy()].tocsr()
     return replace(
         shell,
         rig=rig,
         landmarks=marks,
-        sampler=sampler,
-        nodes=torch.from_numpy(layers.reshape(-1, 3)),
-        thickness=depth,
+        sampler=_surface_sampler(rig, marks.face, bent, followed, places),
+        nodes=torch.from_numpy(nodes),
+        thickness=np.linalg.norm(nodes[-count:] - bent, axis=1),
     )
 
 
-def _spread(shell: Shell, paired: Int[ndarray, "P"], misses: Float[ndarray, "P 3"]) -> Float[ndarray, "N 3"]:
-    """Offsets of all skin nodes that bend least while they meet some of them, softly: 1e-4 of the bending of an edge."""
-    own = shell.nodes[: len(shell)]
-    laplacian = cotangent_laplacian(own, torch.from_numpy(shell.skin_faces), low=1e-3)
-    weights = np.zeros(len(own))
-    weights[paired] = 1.0
-    system = diags_array(weights) + 1e-3 * (laplacian.T @ laplacian) + 1e-9 * eye_array(len(own))
-    side = np.zeros((len(own), 3))
-    side[paired] = misses
-    return factored(system).solve(side)
+_STIFFER = (3e-3, 3e-2, 0.3, 3.0, 30.0, 3e3)
+"""Weights of bending against pairs: the next where one leaves tissue that is turned inside out."""
+
+
+def _bent(
+    shell: Shell,
+    warped: Float[ndarray, "N 3"],
+    places: csr_array,
+    aims: Float[ndarray, "P 3"],
+    confidence: Float[ndarray, "P"],
+    stiffness: float,
+) -> Float[ndarray, "N 3"]:
+    """Skin nodes that meet the pairs and bend little; pairs that would fold the skin are given up around the fold."""
+    faces = shell.skin_faces
+    laplacian = cotangent_laplacian(shell.nodes[: len(shell)], torch.from_numpy(faces), low=1e-3)
+    bending = laplacian.T @ laplacian
+    smoother = _smoother(faces, len(warped))
+    upright = _normals(warped, faces)
+    trust = confidence / confidence.max()
+    for _ in range(12):
+        weighted = places.T @ diags_array(trust)
+        system = weighted @ places + stiffness * bending + 1e-9 * eye_array(len(warped))
+        bent = warped + factored(system).solve(weighted @ (aims - places @ warped))
+        folded = (_normals(bent, faces) * upright).sum(1) < 0.3
+        if not folded.any():
+            break
+        around = np.zeros(len(warped))
+        around[faces[folded]] = 1.0
+        trust = trust * (1 - 0.9 * (places @ _repeated(smoother, around, 3)).clip(0, 0.3) / 0.3)
+    return bent
+
+
+def _normals(points: ndarray, faces: ndarray) -> Float[ndarray, "F 3"]:
+    a, b, c = points[faces].swapaxes(0, 1)
+    return _unit(np.cross(b - a, c - a))
+
+
+def _carried_layers(shell: Shell, bent: Float[ndarray, "N 3"]) -> Float[ndarray, "X 3"]:
+    """Nodes under a bent skin: columns turn with the skin around them, and grow with it."""
+    own = shell.nodes[: len(shell)].numpy()
+    edges = _edges(shell.skin_faces)
+    moments = np.zeros((len(own), 3, 3))
+    spans = [points[edges[:, 1]] - points[edges[:, 0]] for points in (own, bent)]
+    products = np.einsum("ei,ej->eij", spans[1], spans[0])
+    for end in (0, 1):
+        np.add.at(moments, edges[:, end], products)
+    # The thin tissue of a sheet says nothing across it: its normals do.
+    normals = [vertex_normals(torch.from_numpy(p), torch.from_numpy(shell.skin_faces)).numpy() for p in (own, bent)]
+    moments += np.einsum("n,ni,nj->nij", np.trace(moments, axis1=1, axis2=2).clip(1e-12), normals[1], normals[0])
+    left, _, right = np.linalg.svd(moments)
+    left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
+    turns = left @ right
+    scale = _local_scale(shell.skin_faces, own, bent)
+    columns = shell.nodes.numpy().reshape(-1, len(own), 3) - own
+    nodes = bent + scale[:, None] * np.einsum("nij,lnj->lni", turns, columns)
+    nodes = nodes.reshape(-1, 3)
+    wanted = shell.volumes * scale[shell.tets[:, 0] % len(own)] ** 3
+    return _untangled(nodes, shell.tets, 0.05 * wanted, len(own), shell.height)
 
 
 def _local_scale(faces: ndarray, before: ndarray, after: ndarray) -> Float[ndarray, "N"]:
@@ -630,12 +714,40 @@ def _local_scale(faces: ndarray, before: ndarray, after: ndarray) -> Float[ndarr
     return _repeated(_smoother(faces, len(ratio)), ratio, 4).clip(0.2, 5.0)
 
 
-def _surface_sampler(face: Face, points: ndarray, faces: ndarray, count: int) -> csr_array:
-    """(N, V) shares of the vertices of the face's triangle that is closest to each point."""
-    found, shares = closest_points(torch.from_numpy(points), torch.from_numpy(face.points), torch.from_numpy(face.faces))
-    columns = face.vertices[face.faces[found.numpy()]]
+def _surface_sampler(
+    rig: Rig, face: Face, points: Float[ndarray, "N 3"], followed: csr_array, places: csr_array
+) -> csr_array:
+    """(N, V) shares of the rig's vertices in the place of its face where each skin node lies.
+
+    A node that is the place of a pair takes its partner. Others take the closest place among the triangles around what
+    their neighbours follow: a node of the upper lip is never moved by the lower one, however close.
+    """
+    numbers = np.full(len(rig.neutral), -1)
+    numbers[face.vertices] = np.arange(len(face.vertices))
+    local = followed[:, face.vertices]
+    rings = _smoother(face.faces, len(face.vertices))
+    near = ((local != 0).astype(float) @ rings @ rings).tocsr()
+    width = 24
+    candidates = np.zeros((len(points), width), np.int64)
+    for row in range(len(points)):
+        found = near.indices[near.indptr[row] : near.indptr[row + 1]]
+        if len(found) == 0:
+            found = np.array([np.linalg.norm(face.points - points[row], axis=1).argmin()])
+        if len(found) > width:
+            found = found[np.argsort(np.linalg.norm(face.points[found] - points[row], axis=1))[:width]]
+        candidates[row] = np.resize(found, width)
+    triangle, shares = closest_points_around(
+        *(torch.from_numpy(each) for each in (points, face.points, face.faces, candidates))
+    )
+    columns = face.vertices[face.faces[triangle.numpy()]]
     rows = np.repeat(np.arange(len(points)), 3)
-    return coo_array((shares.double().numpy().ravel(), (rows, columns.ravel())), shape=(len(points), count)).tocsr()
+    shape = (len(points), len(rig.neutral))
+    closest = coo_array((shares.double().numpy().ravel(), (rows, columns.ravel())), shape=shape).tocsr()
+    whole = np.zeros(len(points))
+    entries = places.tocoo()
+    whole[entries.col[entries.data > 0.999]] = 1.0
+    whole *= followed.sum(1) > 0.999
+    return (diags_array(1 - whole) @ closest + diags_array(whole) @ followed).tocsr()
 
 
 # ---- layers ----
@@ -672,13 +784,26 @@ def _layers(
         depth = np.maximum(depth * (1 - 0.15 * around), thinnest)
         inward = _turned(skin, faces, inward, np.flatnonzero(around))
     # What is still turned inside out lies under skin that is folded itself, as in the corner of a mouth.
-    nodes = np.ascontiguousarray(layers.reshape(-1, 3))
-    mobility = np.ones(len(nodes))
-    mobility[: len(skin)] = 0.1
-    for share in (1 / 2, 1 / 20, 0.0):
-        if _untangle(nodes, tets, (share * least).clip(min=1e-9 * height**3), mobility, 500):
-            break
+    nodes = _untangled(layers.reshape(-1, 3), tets, least / 2, len(skin), height)
     return nodes.reshape(layers.shape), depth
+
+
+def _untangled(
+    nodes: Float[ndarray, "X 3"], tets: ndarray, least: Float[ndarray, "M"], skin: int, height: float
+) -> Float[ndarray, "X 3"]:
+    """Nodes moved until every tetrahedron has its least volume, or at least a positive one; skin as little as can be."""
+    nodes = np.array(nodes)
+    for share, floor, mobility_of_skin in ((1.0, 1e-9, 0.1), (0.1, 1e-9, 0.3), (0.0, 1e-10, 1.0), (0.0, 1e-12, 1.0)):
+        goal = (share * least).clip(min=floor * height**3)
+        mobility = np.ones(len(nodes))
+        mobility[:skin] = mobility_of_skin
+        for _ in range(60):
+            failed = tet_volumes(nodes, tets) < 0.99 * goal
+            if not failed.any():
+                return nodes
+            near = np.isin(tets, tets[failed]).any(1)
+            _untangle(nodes, tets[near], goal[near], mobility, 30)
+    return nodes
 
 
 def _areas(points: ndarray, faces: ndarray) -> Float[ndarray, "F"]:
@@ -855,6 +980,10 @@ def _harmonic(rig: Rig, unknown: ndarray, numbers: ndarray, place: ndarray) -> c
 # Skin that passes through skin
 
 
+_DEEPEST = {"lips": 0.06, "lids_left": 0.03, "lids_right": 0.03}
+"""Share of H beyond which a point is taken to lie behind the other side, not in it: what lips and lids are thick."""
+
+
 def interpenetration(shell: Shell, vertices: Float[Tensor, "T V 3"]) -> dict[str, Float[Tensor, "T"]]:
     """How deep the two sides of each contact lie in each other, metres; 0 where they do not.
 
@@ -866,7 +995,7 @@ def interpenetration(shell: Shell, vertices: Float[Tensor, "T V 3"]) -> dict[str
     depths = {}
     for name, contact in shell.contacts.items():
         sides = [_Side.of(shell.rig, side) for side in (contact.upper.numpy(), contact.lower.numpy())]
-        limit = 0.06 * shell.height
+        limit = _DEEPEST[name] * shell.height
         frames = []
         for mesh in vertices.double().numpy():
             found = [first.depths(mesh, second, limit) for first, second in (sides, sides[::-1])]
@@ -920,7 +1049,11 @@ class _Side:
         on_edge = other.edge[corners].any(1) | (distance == 0)
         own = vertex_normals(torch.from_numpy(mesh[self.number]), torch.from_numpy(self.local)).numpy()[self.place]
         facing = (own * normal).sum(1) < 0
-        inside = ((away * normal).sum(1) < 0) & ~on_edge & facing & (distance < limit)
+        flat = np.cross(
+            surface[corners[:, 1]] - surface[corners[:, 0]], surface[corners[:, 2]] - surface[corners[:, 0]]
+        )
+        behind = ((away * normal).sum(1) < 0) & ((away * flat).sum(1) < 0)
+        inside = behind & ~on_edge & facing & (distance < limit)
         return inside, distance, number[corners], shares, normal
 
 
