@@ -371,6 +371,8 @@ class Shell:
     """Metres from skin to bone."""
     jaw_share: Float[ndarray, "N"]
     """How far the tissue follows the jaw."""
+    slits: dict[str, Int[ndarray, "P 2"]]
+    """Skin nodes above and below each contact, in order; the same in every rig that the shell is carried to."""
     config: ShellConfig
 
     def __post_init__(self) -> None:
@@ -492,6 +494,33 @@ class Shell:
         return states
 
     @cached_property
+    def node_volumes(self) -> Float[ndarray, "X"]:
+        """A quarter of the tissue around each node, cubic metres."""
+        return np.bincount(self.tets.ravel(), np.repeat(self.volumes / 4, 4), len(self.nodes))
+
+    @cached_property
+    def skin_areas(self) -> Float[ndarray, "N"]:
+        """A third of the skin around each node, square metres."""
+        skin = self.nodes[: len(self)].numpy()
+        return np.bincount(self.skin_faces.ravel(), np.repeat(_areas(skin, self.skin_faces) / 3, 3), len(self))
+
+    @cached_property
+    def colliders(self) -> Int[ndarray, "D"]:
+        """Vertices of the teeth: loose pieces near the mouth that move with the jaw or not at all."""
+        marks, points = self.landmarks, self.rig.neutral.double().numpy()
+        if marks.mouth is None:
+            return np.zeros(0, np.int64)
+        members = np.concatenate([marks.jaw_pieces, marks.skull_pieces])
+        pieces = connected_pieces(self.rig.faces.numpy(), len(points))
+        near = [
+            piece
+            for piece in np.unique(pieces[members])
+            if np.linalg.norm(points[pieces == piece].mean(0) - marks.mouth) < 0.6 * marks.height
+            and points[pieces == piece, 1].mean() < marks.mouth[1] + 0.3 * marks.height
+        ]
+        return members[np.isin(pieces[members], near)]
+
+    @cached_property
     def _inside(self) -> tuple[ndarray, ndarray, ndarray, SuperLU, csr_array]:
         """Held nodes, free ones, their stiffness, the factored matrix of the free ones, and its part for held ones."""
         fixed = (self.bone > 0) | self.border
@@ -579,6 +608,7 @@ def build_shell(rig: Rig, thickness: Float[Tensor, "V"] | None = None, config: S
     layers, depth = _layers(rig, marks, face.points, face.faces, wanted, config)
     border = _outer_border(face)
     bone = _bones(marks, border, depth, config)
+    slits = {name: np.searchsorted(numbers, contact.pairs.numpy()) for name, contact in marks.contacts.items()}
     return Shell(
         rig=rig,
         landmarks=marks,
@@ -592,6 +622,7 @@ def build_shell(rig: Rig, thickness: Float[Tensor, "V"] | None = None, config: S
         border=np.tile(border, config.layers + 1),
         thickness=depth,
         jaw_share=marks.jaw_share,
+        slits=slits,
         config=config,
     )
 
@@ -994,7 +1025,7 @@ def interpenetration(shell: Shell, vertices: Float[Tensor, "T V 3"]) -> dict[str
     shell._check(vertices)
     depths = {}
     for name, contact in shell.contacts.items():
-        sides = [_Side.of(shell.rig, side) for side in (contact.upper.numpy(), contact.lower.numpy())]
+        sides = [Side.of(shell.rig, side) for side in (contact.upper.numpy(), contact.lower.numpy())]
         limit = _DEEPEST[name] * shell.height
         frames = []
         for mesh in vertices.double().numpy():
@@ -1005,7 +1036,7 @@ def interpenetration(shell: Shell, vertices: Float[Tensor, "T V 3"]) -> dict[str
 
 
 @dataclass(frozen=True)
-class _Side:
+class Side:
     """One side of a contact: its vertices and the faces around them."""
 
     vertices: ndarray
@@ -1019,7 +1050,7 @@ class _Side:
     """Which of `number` are on the border of the faces."""
 
     @classmethod
-    def of(cls, rig: Rig, vertices: Int[ndarray, "U"]) -> _Side:
+    def of(cls, rig: Rig, vertices: Int[ndarray, "U"]) -> Side:
         faces = rig.faces.numpy()
         member = np.zeros(len(rig.neutral), bool)
         member[vertices] = True
@@ -1029,13 +1060,26 @@ class _Side:
         edge = np.isin(np.arange(len(number)), boundary_edges(local))
         return cls(vertices, number, local, np.searchsorted(number, vertices), edge)
 
-    def depths(self, mesh: ndarray, other: _Side, limit: float) -> Float[ndarray, "U"]:
+    def depths(self, mesh: ndarray, other: Side, limit: float) -> Float[ndarray, "U"]:
         """How deep this side's vertices are inside the other."""
         inside, distance, _, _, _ = self.hits(mesh, other, limit)
         return np.where(inside, distance, 0.0)
 
-    def hits(self, mesh: ndarray, other: _Side, limit: float):
-        """Which of this side's vertices are inside the other, how deep, and where they would come out."""
+    def hits(
+        self, mesh: Float[ndarray, "V 3"], other: Side, limit: float, facing: bool = True
+    ) -> tuple[ndarray, ndarray, ndarray, ndarray, ndarray]:
+        """Which of this side's vertices are inside the other, how deep, and where they would come out.
+
+        Args:
+            mesh: Of the rig.
+            other: Whose surface they may have passed.
+            limit: Metres; what is farther behind the surface is not in it.
+            facing: Only vertices whose own normal is opposed to that of the other surface.
+
+        Returns:
+            (U,) inside; (U,) distance to the closest point; (U, 3) its corners, vertices of the rig; (U, 3) its shares;
+            (U, 3) its normal.
+        """
         points, number, local = mesh[self.vertices], other.number, other.local
         surface = mesh[number]
         found, shares = closest_points(torch.from_numpy(points), torch.from_numpy(surface), torch.from_numpy(local))
@@ -1047,13 +1091,14 @@ class _Side:
         distance = np.linalg.norm(away, axis=1)
         # Beside the border of the other side nothing tells in from out; and skin that meets skin faces it.
         on_edge = other.edge[corners].any(1) | (distance == 0)
-        own = vertex_normals(torch.from_numpy(mesh[self.number]), torch.from_numpy(self.local)).numpy()[self.place]
-        facing = (own * normal).sum(1) < 0
         flat = np.cross(
             surface[corners[:, 1]] - surface[corners[:, 0]], surface[corners[:, 2]] - surface[corners[:, 0]]
         )
         behind = ((away * normal).sum(1) < 0) & ((away * flat).sum(1) < 0)
-        inside = behind & ~on_edge & facing & (distance < limit)
+        inside = behind & ~on_edge & (distance < limit)
+        if facing:
+            own = vertex_normals(torch.from_numpy(mesh[self.number]), torch.from_numpy(self.local)).numpy()[self.place]
+            inside &= (own * normal).sum(1) < 0
         return inside, distance, number[corners], shares, normal
 
 
