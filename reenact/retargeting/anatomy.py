@@ -76,7 +76,7 @@ class ShellConfig:
     """Most of the way to the other side of the same flesh, so that lips and lids do not meet inside."""
     other_share: float = 0.9
     """Most of the way to teeth, eyeballs and the lining of the mouth."""
-    slide: float = 1.0
+    slide: float = 1.5
     """Skin that expressions move over the bone by more than this many thicknesses is not grown to it."""
     opening: float = 0.1
     """Distance from lips and lids, share of H, within which there is no bone."""
@@ -926,6 +926,9 @@ def _bones(marks: Landmarks, border: ndarray, depth: ndarray, config: ShellConfi
     deltas[marks.jaw_shape] -= marks.jaw_share.round()[:, None] * rigid
     slide = np.linalg.norm(deltas, axis=-1).max(0)
     label = np.where(marks.jaw_share > 0.8, JAW, np.where(marks.jaw_share < 0.25, SKULL, 0))
+    if marks.mouth is not None:
+        # Under the jaw there is throat, not skull: it gives way when the jaw comes down on it.
+        label[(label == SKULL) & (face.points[:, 1] < marks.mouth[1])] = 0
     label[slide > config.slide * depth] = 0
     for contact in marks.contacts.values():
         starts = np.flatnonzero(np.isin(face.vertices, torch.cat([contact.upper, contact.lower]).numpy()))
