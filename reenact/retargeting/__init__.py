@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 
+from reenact.retargeting.anacondar import Anacondar
 from reenact.retargeting.cross_mapping import CrossMapping, KernelCCA
 from reenact.retargeting.deformation_transfer import DeformationTransfer
 from reenact.retargeting.delta_transfer import DeltaTransfer
@@ -23,6 +24,7 @@ METHODS: dict[str, Callable[..., Retargeter]] = {
     "delta-transfer": DeltaTransfer,
     "deformation-transfer": DeformationTransfer,
     "facial-rigging": FacialRigging,
+    "anacondar": Anacondar,
     "cross-mapping": CrossMapping,
     "kernel-cca": KernelCCA,
     "velocity": VelocityMatching,

@@ -1021,8 +1021,8 @@ _DEEPEST = {"lips": 0.06, "lids_left": 0.03, "lids_right": 0.03}
 def interpenetration(shell: Shell, vertices: Float[Tensor, "T V 3"]) -> dict[str, Float[Tensor, "T"]]:
     """How deep the two sides of each contact lie in each other, metres; 0 where they do not.
 
-    A vertex of one side is inside the other where the closest point of that side's skin faces away from it, and is no
-    border of it. Its depth is the distance to that point. Where sides already lie in each other at rest, as lips do in
+    A vertex of one side is inside the other where the closest point of that side's skin faces away from it, within 60
+    degrees of straight, and is no border of it. Its depth is the distance to that point. Where sides already lie in each other at rest, as lips do in
     some sculpted neutrals, that depth counts too.
     """
     shell._check(vertices)
@@ -1097,7 +1097,8 @@ class Side:
         flat = np.cross(
             surface[corners[:, 1]] - surface[corners[:, 0]], surface[corners[:, 2]] - surface[corners[:, 0]]
         )
-        behind = ((away * normal).sum(1) < 0) & ((away * flat).sum(1) < 0)
+        # The way out of flesh runs along the normal; a way across it leads around an edge.
+        behind = ((away * normal).sum(1) < -0.5 * distance) & ((away * flat).sum(1) < 0)
         inside = behind & ~on_edge & (distance < limit)
         if facing:
             own = vertex_normals(torch.from_numpy(mesh[self.number]), torch.from_numpy(self.local)).numpy()[self.place]
