@@ -62,8 +62,8 @@ class AnacondarConfig:
     physics: PhysicsConfig | None = field(default_factory=PhysicsConfig)
     """Weights of the simulation; None leaves it out."""
     characteristics: Literal["source", "target"] = "source"
-    """Whose slits, widths and contours the simulation keeps: those of the source's frame, in the target's size, or those
-    that examples and transfer have made."""
+    """Whose slits, widths and contours the simulation keeps: those of the source's frame, in the target's size, or what
+    examples and transfer have made of them."""
 
 
 @dataclass(frozen=True)
