@@ -206,13 +206,31 @@ def test_patches_are_carried_to_another_mesh(toy_pair, examples, frames):
     pairs = Correspondence.identity(source, target)
     pairs = Correspondence(pairs.source, Places.at(back), pairs.confidence)
     method = PatchwiseBlendshapes(source, shuffled, examples[0], examples[1][:, order], pairs)
-    same = PatchwiseBlendshapes(source, target, *examples)
+    same = PatchwiseBlendshapes(source, target, *examples, Correspondence.identity(source, target))
     torch.testing.assert_close(method(frames)[:, back], same(frames), rtol=0, atol=1e-9)
     # A vertex without partner belongs where its neighbour does.
     followed = csr_array(np.diag(np.r_[np.zeros(1), np.ones(641)]))
-    carried = same.patches.carried(source, source, followed)
+    carried = same.patches.carried(source, source, followed, smoothing=0)
     nearest = torch.cdist(source.neutral[:1], source.neutral[1:]).argmin() + 1
     np.testing.assert_allclose(carried.shares[[0]].toarray(), carried.shares[[int(nearest)]].toarray())
+
+
+def test_a_frayed_border_is_smoothed(toy_rig):
+    patches = Patches.of(toy_rig, 2, rings=0)
+    labels = patches.shares.toarray().argmax(1)
+    edges = toy_rig.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).numpy()
+    frayed = labels.copy()
+    border = np.unique(edges[labels[edges[:, 0]] != labels[edges[:, 1]]])
+    frayed[border[::2]] = 1 - frayed[border[::2]]
+    followed = csr_array((np.ones(642), (np.arange(642), [np.flatnonzero(labels == label)[0] for label in frayed])))
+    followed = csr_array((followed.data, followed.indices, followed.indptr), shape=(642, 642))
+
+    def jump(smoothing) -> float:
+        shares = patches.carried(toy_rig, toy_rig, followed, smoothing).shares.toarray()
+        return float(np.abs(shares[edges[:, 0]] - shares[edges[:, 1]]).max())
+
+    assert jump(0) == 1
+    assert jump(6) < 0.5
 
 
 def test_pieces_without_pairs_keep_to_their_like(toy_rig):
@@ -224,7 +242,7 @@ def test_pieces_without_pairs_keep_to_their_like(toy_rig):
     other = replace(rig, neutral=rig.neutral * 1.5)
     pairs = csr_array((np.ones(642), (np.arange(642), np.arange(642))), shape=(len(neutral),) * 2)
     patches = Patches.of(rig, 40)
-    carried = patches.carried(rig, other, pairs)
+    carried = patches.carried(rig, other, pairs, smoothing=0)
     np.testing.assert_allclose(carried.shares.toarray(), patches.shares.toarray(), rtol=0, atol=1e-12)
 
 

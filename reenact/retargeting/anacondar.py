@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from reenact.errors import ReenactError
@@ -63,7 +63,7 @@ class AnacondarConfig:
     """Weights of the simulation; None leaves it out."""
     characteristics: Literal["source", "target"] = "source"
     """Whose slits, widths and contours the simulation keeps: those of the source's frame, in the target's size, or what
-    examples and transfer have made of them."""
+    examples and transfer have made of them. The latter also where the source's cannot be told, see `_trusted`."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +140,7 @@ class Anacondar:
             anatomical = isinstance(self.transfer, AnatomicalTransfer)
             self.source_shell = self.transfer.source_shell if anatomical else carry_shell(self.shell, source, dense)
             """The same tissue in the source."""
+            self._trusted = _trusted(self.source_shell, self.shell)
         self._inverse = InverseRig(target)
 
     def __call__(self, clip: Clip) -> Clip:
@@ -177,7 +178,10 @@ class Anacondar:
             transferred = self.transfer.transfer(missing)
         settled = combined = shown + (transferred - neutral)
         if self.physics is not None:
-            kept = features(self.source_shell, vertices) if self.config.characteristics == "source" else None
+            kept: Tensor | None = None
+            if self.config.characteristics == "source":
+                own = features(self.shell, combined)
+                kept = torch.where(self._trusted[:, None], features(self.source_shell, vertices), own)
             settled = self.physics(combined, states=self.shell.fill(combined), features=kept, force=force)
         stages = (explained, shown, missing, transferred, combined, settled)
         return Stages(*(each.to(vertices.dtype) for each in stages))
@@ -201,6 +205,20 @@ class Anacondar:
             check_names(training, self.source)
             weights = training.weights[:: max(1, len(training) // 300)]
         return embed(self.source, self.target, _meshes(self.target, examples), dense, self.source.vertices(weights))
+
+
+def _trusted(source: Shell, target: Shell) -> Bool[Tensor, "C"]:
+    """Characteristics that the shapes of both rigs move about as far, from 0.4 to 2.5 times.
+
+    Where a pair of places is wrong by the thickness of a lip, both ends of a slit may lie on one lip of the source.
+    Such a slit never opens there, and would sew the target's mouth up.
+    """
+    ranges = []
+    for shell in (source, target):
+        shapes = shell.rig.vertices(torch.eye(len(shell.rig.names)))
+        parts = [features(shell, part).norm(dim=-1).amax(0) for part in shapes.split(_CHUNK)]
+        ranges.append(torch.stack(parts).amax(0))
+    return (ranges[0] > 0.4 * ranges[1]) & (ranges[0] < 2.5 * ranges[1])
 
 
 def _meshes(rig: Rig, expressions: Tensor) -> Float[Tensor, "E V 3"]:

