@@ -1,4 +1,4 @@
-"""The commands: reenact train | infer | evaluate | convert | inspect | rigs."""
+"""The commands: reenact train | infer | evaluate | view | render | convert | inspect | rigs."""
 
 from __future__ import annotations
 
@@ -179,6 +179,42 @@ def evaluate(
     console.print(f"Report: {write_report(list(runs), results)}", highlight=False, soft_wrap=True)
 
 
+def view(
+    inputs: Annotated[Positional[tuple[str, ...]], arg(metavar="RUN|RIG [RIG ...]", help_behavior_hint="")],
+    *,
+    clip: Annotated[str | None, arg(metavar="CLIP")] = None,
+    method: Annotated[str | None, arg(metavar="NAME")] = None,
+    audio: Annotated[Path | None, arg(metavar="FILE.wav")] = None,
+    nudges: Annotated[Path | None, arg(metavar="FILE.json")] = None,
+    fps: float | None = None,
+    port: int = 0,
+    browser: bool = True,
+) -> None:
+    """Show rigs and their motion in the browser, and correct it there.
+
+    A page of this machine: the clip plays on the source and on every target, by any method, with sliders for all shapes.
+    Nothing leaves the machine. Ctrl-C ends it. docs/viewer.md tells what the page can do.
+
+    Args:
+        inputs: The folder that `reenact train` wrote, or rigs, the source first: built-in names or files.
+        clip: Motion of the source; what the source's file holds unless said, or ten seconds that are made up.
+        method: Shown first on the targets; the run's networks unless said, else what names tell, else shape-matching.
+        audio: Sound that plays along.
+        nudges: Where corrections are kept; RUN/nudges.json unless said, and nowhere without a run.
+        fps: Frames per second to play at; those of the clip unless said.
+        port: Of the page's address; any free one unless said.
+        browser: Open the page.
+    """
+    if nudges is not None:
+        _check_out(nudges, (".json",))
+    from reenact.viewer.server import serve
+    from reenact.viewer.session import Session
+
+    with Console(stderr=True).status("Loading"):
+        session = Session.open(inputs, clip, method, audio, nudges, fps)
+    serve(session, port, browser)
+
+
 def convert(
     input: Annotated[Positional[str], arg(metavar="IN")],
     output: Annotated[Positional[Path], arg(metavar="OUT")],
@@ -304,6 +340,7 @@ COMMANDS = {
     "train": train,
     "infer": infer,
     "evaluate": evaluate,
+    "view": view,
     "convert": convert,
     "inspect": inspect,
     "rigs": rigs,
