@@ -33,14 +33,14 @@ export async function floats(path, array, arrived = () => {}, options = {}) {
   const bytes = new Uint8Array(array.buffer, array.byteOffset, array.byteLength);
   const reader = answer.body.getReader();
   let place = 0;
-  for (;;) {
+  while (place < bytes.length) {
     const { done, value } = await reader.read();
-    if (done) break;
+    if (done) throw new Error(`${path}: the viewer stopped half way`);
     bytes.set(value, place);
     place += value.length;
     arrived(place >> 2);
   }
-  if (place !== bytes.length) throw new Error(`${path}: the viewer stopped half way`);
+  await reader.read().catch(() => {}); // the end of it
 }
 
 export function post(path, body, signal) {

@@ -136,6 +136,7 @@ export class Curves {
       for (let frame = first; frame <= last; frame++) pen.lineTo(x(frame), y(values[frame]));
     } else {
       // More frames than pixels: from the lowest to the highest of each column, so that no blink is lost.
+      pen.globalAlpha = 0.7;
       for (let frame = first; frame <= last; frame += perPixel) {
         let least = Infinity, most = -Infinity;
         for (let n = Math.floor(frame); n < Math.min(frame + perPixel, last + 1); n++) {
@@ -147,6 +148,7 @@ export class Curves {
       }
     }
     pen.stroke();
+    pen.globalAlpha = 1;
     pen.setLineDash([]);
   }
 

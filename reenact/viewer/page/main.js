@@ -96,9 +96,9 @@ say("");
 // Cells: a rig by a method
 
 /** The weights of a rig by a method, asked for when they are first needed. */
-function trackOf(rig, method) {
+function trackOf(rig, method, again = false) {
   const key = `${rig.index} ${method}`;
-  if (!tracks.has(key)) {
+  if (!tracks.has(key) || (again && tracks.get(key).failed)) {
     const track = new Track(rig.index, method, frames, rig.shapes.length);
     tracks.set(key, track);
     track.load(() => {
@@ -106,7 +106,6 @@ function trackOf(rig, method) {
         const span = nudges.span(rigs[0].index, frames - 1);
         if (span !== null) follower.follow(track, ...span);
       }
-      if (track.failed) tracks.delete(key); // asked for again, it is tried again
       refreshed();
     });
   }
@@ -166,7 +165,7 @@ function closeCell(cell) {
 
 function setMethod(cell, method) {
   cell.method = cell.select.value = method;
-  cell.track = trackOf(cell.rig, method);
+  cell.track = trackOf(cell.rig, method, true);
   arrange();
   refreshed();
 }
@@ -214,6 +213,7 @@ function refreshed() {
   for (const cell of state.cells) {
     cell.other = state.reference && !cell.rig.isSource && cell.rig.methods.includes(state.reference)
       ? trackOf(cell.rig, state.reference) : null;
+    if (cell.other?.failed) say(`${title(state.reference)}: ${cell.other.failed}`);
     const { track } = cell;
     const waits = !track.whole && !track.failed;
     const share = Math.floor((100 * track.ready) / frames);
@@ -394,7 +394,10 @@ function shapeMoved(shape, value, done) {
   if (state.playing) play(false);
   const { rig, method } = state.active;
   const { frame } = state;
-  if (!state.active.track.whole) return refreshed();
+  if (!state.active.track.whole) {
+    say("This clip is still being retargeted; correct it when it is there");
+    return refreshed();
+  }
   if (dragging !== shape) {
     nudges.begin();
     dragging = shape;
@@ -722,7 +725,7 @@ window.viewer = {
   stage,
   software: stage.software,
   get idle() {
-    return [...tracks.values()].every((track) => track.whole) && !follower.busy;
+    return [...tracks.values()].every((track) => track.whole || track.failed) && !follower.busy;
   },
   measure(count = 60) {
     const from = state.frame;

@@ -14,7 +14,7 @@ export const VIEWS = { front: 0, "three-quarter": 38, side: 88 };
 export const DETAIL = { playing: 0.7, moving: 1, still: 2 };
 
 const ROOM = 1.42; // how much more is seen than a portrait shows: chin, hair and ears
-const MIDDLE = new Vector3(0, 0.013, -0.04); // of what is looked at, metres
+const MIDDLE = new Vector3(0, 0.016, -0.04); // of what is looked at, metres
 
 // Phong 1975, as render/shade.py has it; the light goes with the eye. Where there is no card it is worked out for vertices
 // instead of pixels, which takes half the time and is hard to tell apart on meshes this fine.
