@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rich.console import Console
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from tyro.extras import subcommand_cli_from_dict
 
 from reenact.config import Config, PostConfig, changed_keys, check_config, load_config
@@ -215,6 +215,48 @@ def view(
     serve(session, port, browser)
 
 
+def render(
+    inputs: Annotated[Positional[tuple[str, ...]], arg(metavar="[RUN] CLIP", help_behavior_hint="")],
+    *,
+    out: Annotated[Path, arg(metavar="OUT")],
+    rig: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="RIG", help_behavior_hint="(repeatable)")] = (),
+    method: Annotated[str | None, arg(metavar="NAME")] = None,
+    size: int = 512,
+    fps: float | None = None,
+    audio: Annotated[Path | None, arg(metavar="FILE.wav")] = None,
+    opengl: Annotated[bool, FlagCreatePairsOff] = False,
+) -> None:
+    """Write a film of a clip: an .mp4, a .gif or pictures of one or more rigs, side by side.
+
+    Args:
+        inputs: A clip; or the folder that `reenact train` wrote, with a clip of its source or ten seconds that are made
+            up: the source and the target that follows.
+        out: File to write, .mp4 or .gif, or a new folder for PNGs.
+        rig: Who plays the clip, by the names of the shapes; again for another beside it. The rig in the clip's own file
+            unless said.
+        method: Retarget from the first rig to the others instead; with a run, in place of its networks.
+        size: Height and width of each rig in pixels.
+        fps: Frames per second; those of the clip unless said.
+        audio: Sound for the .mp4.
+        opengl: Draw through pyrender, for large pictures.
+    """
+    if not 16 <= size <= 4096:
+        raise ReenactError(f"--size: expected 16 to 4096 pixels, got {size}")
+    from rich.progress import Progress
+
+    from reenact.video import check_out, performances, save_video
+
+    check_out(out, audio)
+    console = Console(stderr=True)
+    with console.status("Loading"):
+        played = performances(inputs, rig, method, fps)
+    clip = played[0].clip
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("Drawing", total=len(clip))
+        save_video(played, out, size, opengl, audio, lambda done: progress.update(task, completed=done))
+    print(f"{out}: {len(clip)} frames, {clip.duration:.1f} s, {', '.join(each.rig.name for each in played)}")
+
+
 def convert(
     input: Annotated[Positional[str], arg(metavar="IN")],
     output: Annotated[Positional[Path], arg(metavar="OUT")],
@@ -341,6 +383,7 @@ COMMANDS = {
     "infer": infer,
     "evaluate": evaluate,
     "view": view,
+    "render": render,
     "convert": convert,
     "inspect": inspect,
     "rigs": rigs,
