@@ -253,7 +253,7 @@ def _save_gif(frames: Iterator[np.ndarray], out: Path, fps: float, palette: Imag
     ends = (100 * np.arange(1, 1 + 10**6) / fps).round().astype(int)
 
     def quantized(frame: np.ndarray) -> Image.Image:
-        return Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
+        return Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
 
     images = [quantized(frame) for frame in frames]
     durations = 10 * np.diff(ends[: len(images)], prepend=0)
