@@ -192,8 +192,8 @@ def view(
 ) -> None:
     """Show rigs and their motion in the browser, and correct it there.
 
-    A page of this machine: the clip plays on the source and on every target, by any method, with sliders for all shapes.
-    Nothing leaves the machine. Ctrl-C ends it. docs/viewer.md tells what the page can do.
+    A page of this machine: the clip plays on the source and on every target, by any method, with sliders for all
+    shapes. Nothing leaves the machine. Ctrl-C ends it. docs/viewer.md tells what the page can do.
 
     Args:
         inputs: The folder that `reenact train` wrote, or rigs, the source first: built-in names or files.

@@ -258,9 +258,7 @@ def _save_gif(frames: Iterator[np.ndarray], out: Path, fps: float, palette: Imag
     images = [quantized(frame) for frame in frames]
     durations = 10 * np.diff(ends[: len(images)], prepend=0)
     with replacing(out) as path:
-        images[0].save(
-            path, format="GIF", save_all=True, append_images=images[1:], duration=durations.tolist(), loop=0
-        )
+        images[0].save(path, format="GIF", save_all=True, append_images=images[1:], duration=durations.tolist(), loop=0)
 
 
 def _palette(played: Sequence[Performance], size: int) -> Image.Image:

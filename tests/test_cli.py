@@ -67,6 +67,8 @@ def test_help_names_every_command(capsys):
             ["RUN", "CLIP", "--out FILE", "--reverse", "--fps", "--post.gain", "Live Link Face"],
         ),
         ("evaluate", ["[RUN ...]", "--frames INT", "--seed INT", "--suite", "--methods NAME"]),
+        ("view", ["RUN|RIG", "--clip CLIP", "--method NAME", "--audio FILE.wav", "--nudges FILE.json", "--no-browser"]),
+        ("render", ["[RUN] CLIP", "--out OUT", "--rig RIG", "--size INT", "--fps", "--opengl", "side by side"]),
         ("convert", ["IN", "OUT", "--rig RIG", "--parts NAME", "--fps", "--post.smooth FLOAT"]),
         ("inspect", ["--out FILE.png", "--json FILE.json", "--parts NAME", "looks wrong"]),
         ("rigs", ["--out FILE.png", "--size INT"]),

@@ -12,8 +12,7 @@ import re
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
@@ -72,21 +71,21 @@ class Server(ThreadingHTTPServer):
         return f"http://{HOST}:{self.server_port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A browser that goes away in the middle of an answer is no news; anything else is our mistake, and is shown."""
+        """A browser that goes away in the middle of an answer is no news; anything else is our mistake, and shown."""
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
             super().handle_error(request, client_address)
 
 
-def serve(session: Session, port: int = 0, browser: bool = True, say: Callable[[str], None] = partial(print, flush=True)) -> None:
-    """Serves until Ctrl-C."""
+def serve(session: Session, port: int = 0, browser: bool = True) -> None:
+    """Serves until Ctrl-C, and prints where."""
     with Server(session, port) as server:
-        say(f"{server.url} shows {' and '.join(session.rigs)}; Ctrl-C ends it")
-        if browser:
-            threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
         try:
+            print(f"{server.url} shows {' and '.join(session.rigs)}; Ctrl-C ends it", flush=True)
+            if browser:
+                threading.Thread(target=webbrowser.open, args=(server.url,), daemon=True).start()
             server.serve_forever()
         except KeyboardInterrupt:
-            say("stopped")
+            print("stopped")
 
 
 class _Refused(Exception):
@@ -119,7 +118,9 @@ class _Handler(BaseHTTPRequestHandler):
                 raise _Refused(HTTPStatus.FORBIDDEN, f"expected a request to {HOST}, got another host")
             site = self.headers.get("Sec-Fetch-Site", "same-origin")
             origin = self.headers.get("Origin")
-            if site not in ("same-origin", "none") or (origin and origin.removeprefix("http://") not in self.server.hosts):
+            if site not in ("same-origin", "none") or (
+                origin and origin.removeprefix("http://") not in self.server.hosts
+            ):
                 raise _Refused(HTTPStatus.FORBIDDEN, "expected a request of the page itself, got one of another page")
             path = self.path.split("?", 1)[0]
             parts = [unquote(part) for part in path.split("/")[1:]] if path.startswith("/") else [""] * 9

@@ -1,7 +1,7 @@
 """Session: what one viewer shows. Rigs as bytes for the page, and the clip on each of them by any method.
 
-Numbers cross to the page as they lie in memory: geometry once per rig as safetensors, weights as rows of float32. The page
-bends the meshes itself, so that a frame costs no request.
+Numbers cross to the page as they lie in memory: geometry once per rig as safetensors, weights as rows of float32. The
+page bends the meshes itself, so that a frame costs no request.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class Session:
             rigs: By key; the source first.
             clip: With the source's shapes, in its order.
             clip_name: As the user named it.
-            files: Of the rigs that came from one, by key: exports animate the avatar itself, and what animation it holds
-                is a method of its own.
+            files: Of the rigs that came from one, by key: exports animate the avatar itself, and what animation it
+                holds is a method of its own.
             run: Trained on the first two rigs.
             method: Shown first on every target; the run's networks, or names, or shapes, unless said.
             audio: A .wav that plays along.
@@ -84,7 +84,9 @@ class Session:
         if len(clip) == 0:
             raise ReenactError(f"{clip_name}: expected frames to play, got none")
         if audio is not None and (audio.suffix.lower() != ".wav" or not audio.is_file()):
-            raise ReenactError(f"{audio}: expected a .wav file, got {'none' if not audio.exists() else 'something else'}")
+            raise ReenactError(
+                f"{audio}: expected a .wav file, got {'none' if not audio.exists() else 'something else'}"
+            )
         self.rigs, self.clip, self.clip_name = rigs, clip, clip_name
         self.files, self.run, self.audio, self.nudges_path = files or {}, run, audio, nudges_path
         self.source, *self.targets = rigs
@@ -220,7 +222,9 @@ class Session:
             yield clip.weights.float()
             return
         if method not in self.methods.get(key, ()):
-            raise ReenactError(f"{key}: expected a method of {', '.join(self.methods.get(key, ('clip',)))}, got {method}")
+            raise ReenactError(
+                f"{key}: expected a method of {', '.join(self.methods.get(key, ('clip',)))}, got {method}"
+            )
         if method == "file" and weights is not None:
             raise ReenactError(f"{key}: expected a method that follows the source, got the animation of a file")
         with self._lock, warnings.catch_warnings():
@@ -275,7 +279,9 @@ class Session:
     def _checked(self, nudges: Nudges, where: str) -> Nudges:
         own = {key: rig.names for key, rig in self.rigs.items()}
         if any(own.get(key, names) != names for key, names in nudges.rigs.items()):
-            raise ReenactError(f"{where}: expected nudges of these rigs, got other shapes; name another file by --nudges")
+            raise ReenactError(
+                f"{where}: expected nudges of these rigs, got other shapes; name another file by --nudges"
+            )
         return replace(nudges, rigs={**nudges.rigs, **own})
 
     def _methods(self, key: str) -> list[str]:

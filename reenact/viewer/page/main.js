@@ -5,7 +5,7 @@ import { Curves } from "./curves.js";
 import { Face } from "./face.js";
 import { Nudges } from "./nudges.js";
 import { Panel, make } from "./panel.js";
-import { DETAIL, loadTexture, Stage, VIEWS } from "./stage.js";
+import { DETAIL, loadTexture, Stage } from "./stage.js";
 import { Follower, Track } from "./tracks.js";
 
 const MOST_CELLS = 6;
@@ -28,6 +28,7 @@ const state = {
 };
 const dark = matchMedia("(prefers-color-scheme: dark)");
 let colors = themeColors();
+let dirty = true; // something other than the frame changed
 let asked = false; // for a picture
 const drawn = { count: 0, since: 0 }; // pictures, since when
 let settling = 0; // the timer of a smoother picture
@@ -251,6 +252,11 @@ function motionOf(track) {
 // Drawing
 
 function invalidate() {
+  dirty = true;
+  wake();
+}
+
+function wake() {
   if (asked) return;
   asked = true;
   requestAnimationFrame(tick);
@@ -258,15 +264,16 @@ function invalidate() {
 
 function tick() {
   asked = false;
+  const before = state.frame;
   if (state.playing) advance();
+  if (state.playing) wake();
+  if (state.frame === before && !dirty) return; // a screen is faster than most clips
+  dirty = false;
   clearTimeout(settling);
   stage.setDetail(state.playing ? DETAIL.playing : DETAIL.moving);
   draw();
-  if (!state.playing && stage.software) settling = setTimeout(settle, 250);
-  if (state.playing) {
-    countFrame();
-    invalidate();
-  }
+  if (state.playing) countFrame();
+  else if (stage.software) settling = setTimeout(settle, 250);
 }
 
 function settle() {
@@ -721,7 +728,7 @@ window.viewer = {
   state,
   session,
   nudges,
-  views: VIEWS,
+  audio,
   stage,
   software: stage.software,
   get idle() {
