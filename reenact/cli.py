@@ -120,7 +120,7 @@ def infer(
         from reenact.inference import ImageRetargeter
 
         retargeter: Any = ImageRetargeter.load(inputs[0], reverse=reverse)
-        names = [retargeter.config.source, retargeter.config.target][:: -1 if reverse else 1]
+        names = [retargeter.run.config.source, retargeter.run.config.target][:: -1 if reverse else 1]
         moved = _moved(retargeter, inputs[-1])
     else:
         moved, retargeter, names = _geometric(inputs, method, source, target, correspondence, training, reverse)

@@ -51,13 +51,18 @@ class LayoutConfig:
 
 @dataclass(frozen=True)
 class PairsConfig:
-    """Which shapes of two rigs do the same, found by what they look like; see `reenact.pairs`."""
+    """What is known of expressions of one rig on the other before any training; see `reenact.pairs`."""
 
-    method: Literal["found", "none"] = "found"
-    """`found` compares the motion passes of single shapes and trains on the pairs that both rigs agree on; `none`
-    leaves the networks to what they share by themselves."""
+    method: Literal["geometry", "pictures", "none"] = "geometry"
+    """`geometry` finds places of the two surfaces that belong together and lets geometric methods label expressions,
+    with the help of pictures; `pictures` compares the motion passes of single shapes, and needs no meshes beyond the
+    renderer; `none` leaves the networks to what they share by themselves."""
+    correspondence: str | None = None
+    """A file of pairs of places, source and target; None finds them."""
+    markers: int = 300
+    """Pairs of places that are found."""
     similarity: float = 0.3
-    """Least correlation of the motion passes of two shapes that count as one."""
+    """Least correlation of the motion passes of two shapes that count as one in pictures."""
     margin: float = 0.05
     """By how much the next best shape must correlate less."""
 
@@ -71,7 +76,7 @@ class ReenactNetConfig:
     family."""
     code: int = 256
     """Size of the bottleneck. Far larger ones let identity leak into the code."""
-    components: int = 256
+    components: int = 512
     """Principal components of what is read from a rig's pictures."""
     color_components: int = 128
     """Principal components of the colours that are drawn beside the motion pass."""
@@ -138,8 +143,13 @@ class TrainingConfig:
     loss: Literal["l1", "l1+l2"] = "l1+l2"
     """Convolutional: distance of redrawn pictures, the published L1, or L1 plus squares. Residuals are nearly all
     zeros, and L1 alone takes thousands of steps to leave the zero picture."""
+    together: bool = True
+    """Train ReenactNet and every BPNet in one stage; the published method trains them one after the other."""
     pair_loss: float = 1.0
     """Factor of the distance between what is drawn of the other rig's paired picture and the pair."""
+    read_loss: float = 1.0
+    """Together: factor of the error of the weights that BPNet reads from what ReenactNet draws of the other rig's
+    picture. It reaches back into ReenactNet, which learns to draw what is read right."""
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
     """How the learning rate changes over the steps."""
     optimizer: Literal["adamw", "adam"] = "adamw"
@@ -297,10 +307,10 @@ def check_config(config: Config, origin: str = "settings") -> None:
                 f"{origin}: {section}.epochs: expected training.refresh = 0 beside it, got {config.training.refresh}; "
                 "epochs are passes over pictures that stay the same"
             )
-    if config.pairs.method == "found" and not config.images.motion:
+    if config.pairs.method == "pictures" and not config.images.motion:
         raise ReenactError(
-            f'{origin}: pairs.method: expected images.motion beside "found", got none; colours alone pair the wrong '
-            'shapes, set pairs.method to "none"'
+            f'{origin}: pairs.method: expected images.motion beside "pictures", got none; colours alone pair the wrong '
+            'shapes, set pairs.method to "geometry" or "none"'
         )
     if config.images.motion and not config.images.residual:
         raise ReenactError(
@@ -351,6 +361,8 @@ _ALLOWED: dict[str, _Rule] = {
     "training.weight_decay": _NOT_NEGATIVE,
     "training.elastic": _FRACTION,
     "training.pair_loss": _NOT_NEGATIVE,
+    "training.read_loss": _NOT_NEGATIVE,
+    "pairs.markers": ("a whole number from 50 to 5,000", lambda value: 50 <= value <= 5000),
     "training.crowded": _FRACTION,
     "training.frames": ("a whole number from 8 to 1,000,000", lambda value: 8 <= value <= 1_000_000),
     "training.refresh": ("a whole number of at least 0", lambda value: value >= 0),

@@ -125,7 +125,10 @@ def test_whole_numbers_may_stand_for_fractions(tmp_path):
         ("[reenactnet]\nkernel = 4", "reenactnet.kernel: expected an odd number from 3 to 15, got 4"),
         ("[training]\nepochs = 3", "training.epochs: expected training.refresh = 0 beside it, got 2000"),
         ("[bpnet]\nepochs = 3", "bpnet.epochs: expected training.refresh = 0 beside it, got 2000"),
-        ("[images]\nmotion = false", 'pairs.method: expected images.motion beside "found", got none'),
+        (
+            '[images]\nmotion = false\n[pairs]\nmethod = "pictures"',
+            'pairs.method: expected images.motion beside "pictures", got none',
+        ),
         ("[images]\nresidual = false", "images.motion: expected images.residual beside it, got none"),
         ("[training]\nframes = 7", "training.frames: expected a whole number from 8 to 1,000,000, got 7"),
         ("[bpnet]\nweight_loss = 0\nimage_loss = 0\nvertex_loss = 0", "bpnet: expected a loss above 0"),
