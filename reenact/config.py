@@ -132,8 +132,8 @@ class BPNetConfig:
 class TrainingConfig:
     """Optimization of ReenactNet, and what both networks share."""
 
-    steps: int = 4000
-    """Optimizer steps of ReenactNet."""
+    steps: int = 5000
+    """Optimizer steps; of ReenactNet alone where it is trained first."""
     epochs: float | None = None
     """Passes over the `frames` pictures, where they are never refreshed; None counts in `steps`."""
     batch_size: int = 64
@@ -161,11 +161,11 @@ class TrainingConfig:
     Helps where no pairs teach it to overlook how faces differ."""
     motion_weighting: bool = True
     """Convolutional: weight the reconstruction by where each rig's pictures move."""
-    crowded: float = 0.0
+    crowded: float = 0.3
     """Share of random expressions that move any number of shapes, up to all, more weakly, as recorded faces do."""
-    frames: int = 8192
+    frames: int = 6144
     """Rendered expressions of each rig that are in memory at a time."""
-    refresh: int = 2000
+    refresh: int = 2500
     """Steps after which fresh expressions replace them; 0 keeps the first."""
     seed: int = 0
     """Seed of every random number in the run."""

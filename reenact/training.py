@@ -412,9 +412,9 @@ def _step_count(steps: int, epochs: float | None, frames: int, batch_size: int) 
 
 def _optimizer(config: Config, stage: _Stage) -> torch.optim.Optimizer:
     if config.training.optimizer == "adam":
-        return torch.optim.Adam(stage.network.parameters(), lr=stage.learning_rate)
-    return torch.optim.AdamW(
-        stage.network.parameters(), lr=stage.learning_rate, weight_decay=config.training.weight_decay
+        return torch.optim.Adam(stage.network.parameters(), lr=stage.learning_rate, fused=True)
+    return torch.optim.AdamW(  # fused: a quarter of each step's time otherwise
+        stage.network.parameters(), lr=stage.learning_rate, weight_decay=config.training.weight_decay, fused=True
     )
 
 
