@@ -37,8 +37,10 @@ class ImageConfig:
 class LayoutConfig:
     """One 2-D warp per rig that puts its eyes, mouth and outline on the pixels of the source's."""
 
-    method: Literal["found", "none"] = "found"
-    """`found` registers neutral pictures, part maps and motion energy; `none` leaves the pictures as framed."""
+    method: Literal["found", "pictures", "none"] = "found"
+    """`pictures` registers neutral pictures, part maps and motion energy; `found` does so where no correspondence
+    between the surfaces is known (see `pairs.method`), and follows that otherwise; `none` leaves the pictures as
+    framed."""
     grid: int = 9
     """Control points along each side of the displacement grid."""
     steps: int = 120

@@ -26,7 +26,7 @@ from reenact.checkpoint import load_checkpoint, load_tensors, save_tensors
 from reenact.config import Config, load_config, save_config
 from reenact.data import Studio
 from reenact.errors import ReenactError
-from reenact.layout import find_layout
+from reenact.layout import find_layout, lay_out
 from reenact.models import Networks
 from reenact.pairs import Teacher, find_teacher
 from reenact.retargeting.correspondence import (
@@ -94,7 +94,7 @@ class Run:
             for (first, second), correspondence in correspondences.items():
                 (whole / "correspondences").mkdir(exist_ok=True)
                 save_correspondence(correspondence, whole / "correspondences" / _pair_file(list(keyed), first, second))
-            layouts = _find_layouts(keyed, config)
+            layouts = _find_layouts(keyed, correspondences, config)
             save_tensors(layouts, whole / "layouts.safetensors")
             save_config(config, whole / "config.toml")
             # A run appears whole or not at all: by one rename, or with its config, without which it is none, last.
@@ -205,13 +205,23 @@ def networks_state(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
-def _find_layouts(rigs: dict[str, Rig], config: Config) -> dict[str, Tensor]:
+def _find_layouts(
+    rigs: dict[str, Rig], correspondences: dict[tuple[str, str], Correspondence], config: Config
+) -> dict[str, Tensor]:
     """A layout for each rig but the first; none at all where the settings say so."""
     if config.layout.method == "none":
         return {}
     reference, *others = rigs
-    seed = config.training.seed
-    return {key: find_layout(rigs[reference], rigs[key], _LAYOUT_RESOLUTION, config.layout, seed) for key in others}
+    layouts = {}
+    for key in others:
+        known = correspondences.get((reference, key))
+        if config.layout.method == "found" and known is not None:
+            layouts[key] = lay_out(rigs[reference], rigs[key], known, _LAYOUT_RESOLUTION)
+        else:
+            layouts[key] = find_layout(
+                rigs[reference], rigs[key], _LAYOUT_RESOLUTION, config.layout, config.training.seed
+            )
+    return layouts
 
 
 def _find_correspondences(rigs: dict[str, Rig], config: Config) -> dict[tuple[str, str], Correspondence]:
@@ -259,7 +269,7 @@ def _load_layouts(path: Path, config: Config, keys: list[str]) -> dict[str, Tens
     if not path.is_file():
         raise ReenactError(f"{path}: expected the layouts of the run, got no file; restore the folder or train again")
     layouts = load_tensors(path)
-    wanted = keys[1:] if config.layout.method == "found" else []
+    wanted = keys[1:] if config.layout.method != "none" else []
     if sorted(layouts) != sorted(wanted):
         raise ReenactError(
             f"{path}: expected layouts for {', '.join(wanted) or 'no rig'}, got {', '.join(layouts) or 'none'}; "

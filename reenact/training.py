@@ -41,6 +41,8 @@ _PICTURES_PER_COMPONENT = 6
 """Pictures of each rig, per principal component, from which networks learn what varies before any training."""
 _CHUNK = 64
 """Expressions that are photographed at once; part of what makes a run repeatable."""
+_LEAST_TRUST = 0.2
+"""In what a teacher says of any expression: doubtful labels of all expressions beat sure ones of a few."""
 _LOG_EVERY = 20
 """Steps between lines of metrics.jsonl; each holds the mean since the last."""
 
@@ -291,7 +293,7 @@ def _render(shop: _Workshop, key: str, seed: list[int], partners: list[str], pic
             theirs = teacher.weights(weights)
             for chunk in theirs.split(_CHUNK) if pictured else ():
                 pictures.append(net.describe(other, shop.studios[other].show(shop.studios[other].photograph(chunk))))
-            trust = teacher.confidence(weights, theirs) + 1e-6  # rigs that have nothing in common still train
+            trust = teacher.confidence(weights, theirs).clamp_min(_LEAST_TRUST)
             found[other] = _Partners(theirs, torch.cat(pictures) if pictured else None, trust)
     return _Pool(weights, described, seen, found)
 
