@@ -268,7 +268,7 @@ def _network_cell(name: str, config: Config, trial: Trial, seed: int, runs: Path
         seconds = time.process_time() - before
         forward, reverse = ImageRetargeter.load(folder), ImageRetargeter.load(folder, reverse=True)
         numbers = measure(forward, reverse, trial) | {
-            "own": _own_numbers(forward, trial, seed),
+            "own": own_numbers(forward, seed),
             "taught": None
             if forward.paired(trial.truth[:1, :1].expand(1, len(trial.source.names))) is None
             else vertex_error_ratio(trial.target, forward.paired(_weights(trial)), trial.truth),
@@ -384,9 +384,14 @@ def _single_shapes(forward: Retargeter, trial: Trial) -> dict[str, float]:
 
 
 @torch.no_grad()
-def _own_numbers(forward: Any, trial: Trial, seed: int) -> dict[str, float]:
-    """BPNet alone, on pictures of the target's own clips: VER, weight error, and PSNR and SSIM of renders."""
-    target = trial.target
+def own_numbers(forward: Any, seed: int) -> dict[str, float]:
+    """BPNet alone, on pictures of the target's own clips: VER, weight error, and PSNR and SSIM of renders.
+
+    Args:
+        forward: An `ImageRetargeter`.
+        seed: Of the clips.
+    """
+    target = forward.target
     clips = held_out_clips(target.names, 300, seed + 50)  # other clips than the source's
     weights = torch.cat([clip.weights for clip in clips.values()])
     read = torch.cat([forward.read(forward.target_pictures(part)) for part in weights.split(_CHUNK)])
