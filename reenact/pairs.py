@@ -22,6 +22,7 @@ from torch import Tensor
 
 from reenact.config import PairsConfig
 from reenact.data import Studio
+from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.labels import Labels
 
@@ -96,13 +97,18 @@ def find_teacher(
         source: Studio of the rig that motion comes from.
         target: Studio of the rig that it goes to, in the same layout.
         config: What to learn from; anything but "none".
-        correspondence: From the source's surface to the target's, for "geometry".
+        correspondence: From the source's surface to the target's, for "geometry"; pictures teach alone without.
 
     Raises:
-        ReenactError: The correspondence belongs to other rigs.
+        ReenactError: The correspondence belongs to other rigs, or there is neither it nor a motion pass.
     """
     pictures = find_pairs(source, target, config) if "motion" in source.buffers else None
-    geometry = Labels(source.rig, target.rig, correspondence) if config.method == "geometry" else None
+    geometry = None if correspondence is None else Labels(source.rig, target.rig, correspondence)
+    if pictures is None and geometry is None:
+        raise ReenactError(
+            f"{source.rig.name} to {target.rig.name}: expected a correspondence, or images.motion, to learn from; the "
+            'surfaces are too large to register: give pairs.correspondence, or set pairs.method to "none"'
+        )
     return Teacher(pictures, geometry)
 
 

@@ -41,6 +41,8 @@ from reenact.rigs.rig import Rig
 
 _LAYOUT_RESOLUTION = 64
 """Pixels at which layouts are found; a studio enlarges them to the resolution of its pictures."""
+MOST_VERTICES = 50_000
+"""Of rigs whose surfaces are registered; beyond, the registration takes hours and pictures teach alone."""
 _FILE = re.compile(r"(\d+)-(.+)\.npz")
 
 
@@ -230,6 +232,8 @@ def _find_correspondences(rigs: dict[str, Rig], config: Config) -> dict[tuple[st
         return {}
     found = {}
     for first, second in itertools.combinations(rigs, 2):
+        if _too_large(rigs[first], rigs[second], config):
+            continue
         given = config.pairs.correspondence
         found[first, second] = (
             find_correspondence(rigs[first], rigs[second], config.pairs.markers)
@@ -244,11 +248,18 @@ def _load_correspondences(folder: Path, config: Config, rigs: dict[str, Rig]) ->
         return {}
     keys, found = list(rigs), {}
     for first, second in itertools.combinations(keys, 2):
+        if _too_large(rigs[first], rigs[second], config):
+            continue
         path = folder / _pair_file(keys, first, second)
         if not path.is_file():
             raise ReenactError(f"{path}: expected the pairs of places of the run, got no file; train again")
         found[first, second] = load_correspondence(path, rigs[first], rigs[second])
     return found
+
+
+def _too_large(first: Rig, second: Rig, config: Config) -> bool:
+    """Whether no correspondence is looked for; a given one is always taken."""
+    return config.pairs.correspondence is None and max(len(first.neutral), len(second.neutral)) > MOST_VERTICES
 
 
 def _pair_file(keys: list[str], first: str, second: str) -> str:

@@ -198,6 +198,8 @@ def _find_teachers(run: Run, studios: dict[str, Studio], console: Console) -> di
     if run.config.pairs.method == "none":
         return {}
     teachers, words = {}, {}
+    if run.config.pairs.method == "geometry" and not run.correspondences:
+        console.print("The surfaces are too large to register in minutes: pictures alone tell which shapes are one")
     for source in studios:
         for target in studios:
             if source == target:
