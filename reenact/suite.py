@@ -230,7 +230,7 @@ def run_suite(
     return [cell for cell in kept if cell.key in wanted]
 
 
-def _geometric_cells(method: str, correspondence: Correspondence, trials: dict[int, Trial]) -> list[Cell]:
+def _geometric_cells(method: str, correspondence: Correspondence | None, trials: dict[int, Trial]) -> list[Cell]:
     first = next(iter(trials.values()))
     source, target = first.source, first.target
 
@@ -246,7 +246,7 @@ def _geometric_cells(method: str, correspondence: Correspondence, trials: dict[i
             return [cell(seed, seconds=0.0, numbers={}, failed=str(error)) for seed in trials]
         set_up = time.thread_time() - start
         try:
-            reverse = METHODS[method](target, source, correspondence.reversed())
+            reverse = METHODS[method](target, source, correspondence and correspondence.reversed())
         except ReenactError:
             reverse = None
     return [cell(seed, seconds=set_up, numbers=measure(forward, reverse, trial)) for seed, trial in trials.items()]

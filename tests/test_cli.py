@@ -61,7 +61,15 @@ def test_help_names_every_command(capsys):
             "train",
             ["--config FILE.toml", "--resume", "--run", "--source", "--target", "--source-clip", "--target-clip"],
         ),
-        ("train", ["--training.steps INT", "Optimizer steps of ReenactNet.", "--images.no-residual", "{found,none}"]),
+        (
+            "train",
+            [
+                "--training.steps INT",
+                "Optimizer steps; of ReenactNet alone",
+                "--images.no-residual",
+                "{found,pictures,none}",
+            ],
+        ),
         (
             "infer",
             ["RUN", "CLIP", "--out FILE", "--reverse", "--fps", "--post.gain", "Live Link Face"],
