@@ -15,7 +15,7 @@ from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 from tyro.extras import subcommand_cli_from_dict
 
-from reenact.config import Config, PostConfig, changed_keys, check_config, load_config
+from reenact.config import Config, PostConfig, changed_settings, check_config, load_config
 from reenact.errors import ReenactError
 
 # PyTorch's threads wait for work by spinning, and would take the cores from the renderer's threads, which run between
@@ -58,7 +58,7 @@ def train(
         if settings.run is None:
             raise ReenactError("--resume: expected the folder of a run beside it, got none; add --run DIR")
         saved = load_config(_run_config(settings.run))
-        changed = changed_keys(saved, replace(settings, run=saved.run))
+        changed = changed_settings(saved, replace(settings, run=saved.run))
         if changed:
             raise ReenactError(
                 f"{settings.run}: expected the settings that the run began with, got other {', '.join(changed)}; "

@@ -57,8 +57,9 @@ class PairsConfig:
 
     method: Literal["geometry", "pictures", "none"] = "geometry"
     """`geometry` finds places of the two surfaces that belong together and lets geometric methods label expressions,
-    with the help of pictures; `pictures` compares the motion passes of single shapes, and needs no meshes beyond the
-    renderer; `none` leaves the networks to what they share by themselves."""
+    with the help of pictures (of rigs of more than 50,000 vertices, pictures alone); `pictures` compares the motion
+    passes of single shapes, and needs no meshes beyond the renderer; `none` leaves the networks to what they share by
+    themselves."""
     correspondence: str | None = None
     """A file of pairs of places, source and target; None finds them."""
     markers: int = 300
@@ -278,9 +279,9 @@ def config_from_dict(table: dict[str, Any], origin: str = "settings") -> Config:
     return _build(Config, table, origin, prefix="")
 
 
-def changed_keys(old: Config, new: Config) -> list[str]:
-    """Dotted names of the settings whose values differ."""
-    return [key for (key, value), (_, other) in zip(_leaves(old), _leaves(new), strict=True) if value != other]
+def changed_settings(old: Config, new: Config) -> dict[str, Any]:
+    """Dotted names of the settings whose values differ, with the new values."""
+    return {key: other for (key, value), (_, other) in zip(_leaves(old), _leaves(new), strict=True) if value != other}
 
 
 def check_config(config: Config, origin: str = "settings") -> None:
@@ -336,6 +337,7 @@ _ALLOWED: dict[str, _Rule] = {
     "layout.steps": _ONE_OR_MORE,
     "layout.bending": _NOT_NEGATIVE,
     "layout.samples": _ONE_OR_MORE,
+    "pairs.markers": ("a whole number from 50 to 5,000", lambda value: 50 <= value <= 5000),
     "pairs.similarity": _FRACTION,
     "pairs.margin": _FRACTION,
     "reenactnet.code": _ONE_OR_MORE,
@@ -364,7 +366,6 @@ _ALLOWED: dict[str, _Rule] = {
     "training.elastic": _FRACTION,
     "training.pair_loss": _NOT_NEGATIVE,
     "training.read_loss": _NOT_NEGATIVE,
-    "pairs.markers": ("a whole number from 50 to 5,000", lambda value: 50 <= value <= 5000),
     "training.crowded": _FRACTION,
     "training.frames": ("a whole number from 8 to 1,000,000", lambda value: 8 <= value <= 1_000_000),
     "training.refresh": ("a whole number of at least 0", lambda value: value >= 0),

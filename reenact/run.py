@@ -42,7 +42,8 @@ from reenact.rigs.rig import Rig
 _LAYOUT_RESOLUTION = 64
 """Pixels at which layouts are found; a studio enlarges them to the resolution of its pictures."""
 MOST_VERTICES = 50_000
-"""Of rigs whose surfaces are registered; beyond, the registration takes hours and pictures teach alone."""
+"""Of rigs whose surfaces are registered, unless pairs are given. With 100,000 a quarter of an hour was not enough.
+Beyond, pictures teach alone."""
 _FILE = re.compile(r"(\d+)-(.+)\.npz")
 
 
@@ -228,13 +229,8 @@ def _find_layouts(
 
 def _find_correspondences(rigs: dict[str, Rig], config: Config) -> dict[tuple[str, str], Correspondence]:
     """Between all pairs of rigs, where the settings let geometry teach."""
-    if config.pairs.method != "geometry":
-        return {}
-    found = {}
-    for first, second in itertools.combinations(rigs, 2):
-        if _too_large(rigs[first], rigs[second], config):
-            continue
-        given = config.pairs.correspondence
+    found, given = {}, config.pairs.correspondence
+    for first, second in _registered(rigs, config):
         found[first, second] = (
             find_correspondence(rigs[first], rigs[second], config.pairs.markers)
             if given is None
@@ -244,22 +240,21 @@ def _find_correspondences(rigs: dict[str, Rig], config: Config) -> dict[tuple[st
 
 
 def _load_correspondences(folder: Path, config: Config, rigs: dict[str, Rig]) -> dict[tuple[str, str], Correspondence]:
-    if config.pairs.method != "geometry":
-        return {}
-    keys, found = list(rigs), {}
-    for first, second in itertools.combinations(keys, 2):
-        if _too_large(rigs[first], rigs[second], config):
-            continue
-        path = folder / _pair_file(keys, first, second)
+    found = {}
+    for first, second in _registered(rigs, config):
+        path = folder / _pair_file(list(rigs), first, second)
         if not path.is_file():
             raise ReenactError(f"{path}: expected the pairs of places of the run, got no file; train again")
         found[first, second] = load_correspondence(path, rigs[first], rigs[second])
     return found
 
 
-def _too_large(first: Rig, second: Rig, config: Config) -> bool:
-    """Whether no correspondence is looked for; a given one is always taken."""
-    return config.pairs.correspondence is None and max(len(first.neutral), len(second.neutral)) > MOST_VERTICES
+def _registered(rigs: dict[str, Rig], config: Config) -> list[tuple[str, str]]:
+    """Keys of the pairs of rigs that have a correspondence; one that is given is always taken."""
+    if config.pairs.method != "geometry":
+        return []
+    small = [key for key, rig in rigs.items() if len(rig.neutral) <= MOST_VERTICES]
+    return list(itertools.combinations(rigs if config.pairs.correspondence is not None else small, 2))
 
 
 def _pair_file(keys: list[str], first: str, second: str) -> str:

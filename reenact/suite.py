@@ -13,7 +13,9 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
+import re
 import shutil
+import tempfile
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -27,7 +29,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from reenact.config import Config, changed_keys, config_to_dict
+from reenact.config import Config, changed_settings
 from reenact.errors import ReenactError
 from reenact.evaluation import (
     contacts_of,
@@ -38,7 +40,9 @@ from reenact.evaluation import (
     jitter,
     masked_mae,
     moving_vertices,
+    psnr_of,
     skill,
+    speed,
     true_numbers,
     true_weights,
     vertex_error_ratio,
@@ -185,10 +189,15 @@ def run_suite(
         if method not in METHODS:
             raise ReenactError(f"suite: expected methods among {', '.join(METHODS)}, got {method}")
     kept = [] if results is None else load_cells(results)
+    wanted = set()
 
     def missing(source: Rig, target: Rig, method: str) -> list[int]:
-        done = {cell.key for cell in kept} | {cell.key for cell in ([] if results is None else load_cells(results))}
-        return [seed for seed in seeds if (source.name, target.name, method, seed) not in done]
+        nonlocal kept
+        kept = kept if results is None else load_cells(results)  # another process may have made some meanwhile
+        done = {cell.key for cell in kept}
+        keys = {seed: (source.name, target.name, method, seed) for seed in seeds}
+        wanted.update(keys.values())
+        return [seed for seed, key in keys.items() if key not in done]
 
     def keep(cell: Cell) -> None:
         kept.append(cell)
@@ -221,12 +230,6 @@ def run_suite(
                         name, replace(config, source=source_name, target=target_name), trial(seed), seed, runs
                     )
                 )
-    wanted = {
-        (load_rig(a).name, load_rig(b).name, method, seed)
-        for a, b in pairs
-        for method in (*methods, *(configs or {}))
-        for seed in seeds
-    }
     return [cell for cell in kept if cell.key in wanted]
 
 
@@ -254,37 +257,29 @@ def _geometric_cells(method: str, correspondence: Correspondence | None, trials:
 
 def _network_cell(name: str, config: Config, trial: Trial, seed: int, runs: Path | None) -> Cell:
     """Networks trained and measured. Their own seed is the clips' seed."""
-    import tempfile
-
     from reenact.inference import ImageRetargeter
     from reenact.training import train
 
-    plain = lambda rig: rig.name.replace(":", "-").replace("/", "-")  # noqa: E731
     with tempfile.TemporaryDirectory() as spare:
-        folder = (runs or Path(spare)) / f"{name}-{plain(trial.source)}-{plain(trial.target)}-{seed}"
+        title = re.sub(r"[^A-Za-z0-9_-]+", "-", f"{name}-{trial.source.name}-{trial.target.name}-{seed}")
+        folder = (runs or Path(spare)) / title
         config = replace(config, run=str(folder), training=replace(config.training, seed=seed))
         before = time.process_time()
         train(config, resume=(folder / "config.toml").exists())
         seconds = time.process_time() - before
         forward, reverse = ImageRetargeter.load(folder), ImageRetargeter.load(folder, reverse=True)
+        told = forward.paired(_weights(trial))
         numbers = measure(forward, reverse, trial) | {
             "own": own_numbers(forward, seed),
-            "taught": None
-            if forward.paired(trial.truth[:1, :1].expand(1, len(trial.source.names))) is None
-            else vertex_error_ratio(trial.target, forward.paired(_weights(trial)), trial.truth),
-            "speed": speed(forward, _weights(trial)),
+            "taught": None if told is None else vertex_error_ratio(trial.target, told, trial.truth),
+            "speed": speed(forward, _weights(trial), 300, 20),
         }
         if runs is not None:  # only what is needed to use it
             for checkpoint in sorted((folder / "checkpoints").iterdir())[:-1]:
                 if checkpoint.is_dir():
                     shutil.rmtree(checkpoint)
     ignored = ("run", "source", "target", "training.seed", "training.threads")
-    nested = config_to_dict(config)
-    settings = {}
-    for key in changed_keys(Config(), config):
-        if key not in ignored:
-            section, _, leaf = key.rpartition(".")
-            settings[key] = nested[section][leaf] if section else nested[leaf]
+    settings = {key: value for key, value in changed_settings(Config(), config).items() if key not in ignored}
     return Cell(trial.source.name, trial.target.name, name, seed, seconds, numbers, "", settings, code_version())
 
 
@@ -330,37 +325,39 @@ def measure(forward: Retargeter, reverse: Retargeter | None, trial: Trial) -> di
         }
     if reverse is not None:
         recovered = torch.cat([reverse(answer).weights for answer in answers.values()]).float()
-        numbers["cyclic"] = cyclic_numbers(source, recovered, _weights(trial))
+        numbers["cyclic"] = recovered_numbers(source, recovered, _weights(trial))
     return finite(numbers)
 
 
 @torch.no_grad()
-def cyclic_numbers(
+def recovered_numbers(
     rig: Rig, recovered: Float[Tensor, "T K"], original: Float[Tensor, "T K"], resolution: int = SHOWN_AT
 ) -> dict[str, float]:
     """Pictures of recovered weights against those of the original ones, in the rig's own colours.
 
     Returns:
-        `mae` and `ssim` over the full picture, as published, `mae_masked` over the face; `skill` and `skill_masked`,
-        what is gained on a face that does not move; `wmae` and `ver` of the weights.
+        `mae`, `ssim` and `psnr` over the full picture, as published, `mae_masked` over the face; `skill` and
+        `skill_masked`, what is gained on a face that does not move; `wmae` and `ver` of the weights.
 
     Source: Kim et al. 2021, Sec. 4, for the protocol; skill and masks are ours.
     """
     portrait = Portrait.of(rig)
     rest = portrait.render(rig.neutral[None], resolution)["color"]
-    sums = dict.fromkeys(("mae", "ssim", "mae_masked", "still", "still_masked"), 0.0)
+    sums = dict.fromkeys(("mae", "ssim", "mse", "mae_masked", "still", "still_masked"), 0.0)
     for there, back in zip(original.split(_CHUNK), recovered.split(_CHUNK)):
         shown = portrait.render(rig.vertices(there), resolution, ("color", "mask"))
         again = portrait.render(rig.vertices(back), resolution)["color"]
         still = rest.expand_as(again)
         sums["mae"] += float(image_mae(again, shown["color"]).sum())
         sums["ssim"] += float(image_ssim(again, shown["color"]).sum())
+        sums["mse"] += float((again - shown["color"]).double().square().mean((1, 2, 3)).sum())
         sums["mae_masked"] += float(masked_mae(again, shown["color"], shown["mask"]).sum())
         sums["still"] += float(image_mae(still, shown["color"]).sum())
         sums["still_masked"] += float(masked_mae(still, shown["color"], shown["mask"]).sum())
     means = {name: value / len(original) for name, value in sums.items()}
     return {
         **{name: means[name] for name in ("mae", "ssim", "mae_masked")},
+        "psnr": psnr_of(means["mse"]),
         "skill": skill(means["mae"], means["still"]),
         "skill_masked": skill(means["mae_masked"], means["still_masked"]),
         "wmae": float((recovered - original).abs().mean()),
@@ -395,34 +392,8 @@ def own_numbers(forward: Any, seed: int) -> dict[str, float]:
     clips = held_out_clips(target.names, 300, seed + 50)  # other clips than the source's
     weights = torch.cat([clip.weights for clip in clips.values()])
     read = torch.cat([forward.read(forward.target_pictures(part)) for part in weights.split(_CHUNK)])
-    portrait = Portrait.of(target)
-    squared, similar = 0.0, 0.0
-    for there, back in zip(weights.split(_CHUNK), read.split(_CHUNK)):
-        shown, again = (portrait.render(target.vertices(each), SHOWN_AT)["color"] for each in (there, back))
-        squared += float((shown - again).double().square().mean((1, 2, 3)).sum())
-        similar += float(image_ssim(again, shown).sum())
-    return {
-        "ver": vertex_error_ratio(target, read, weights),
-        "wmae": float((read - weights).abs().mean()),
-        "psnr": -10 * float(np.log10(max(squared / len(weights), 1e-12))),
-        "ssim": similar / len(weights),
-    }
-
-
-def speed(forward: Any, weights: Float[Tensor, "T Ks"], count: int = 300, warm_up: int = 20) -> dict[str, float]:
-    """Frames one at a time, rendering included: frames a second, and milliseconds at the median and 99th percentile."""
-    rows = weights[torch.linspace(0, len(weights) - 1, count + warm_up).long()]
-    seconds = []
-    for row in rows:
-        start = time.perf_counter()
-        forward.step(row)
-        seconds.append(time.perf_counter() - start)
-    milliseconds = 1000 * np.array(seconds[warm_up:])
-    return {
-        "fps": 1000 / float(milliseconds.mean()),
-        "p50_ms": float(np.quantile(milliseconds, 0.5)),
-        "p99_ms": float(np.quantile(milliseconds, 0.99)),
-    }
+    seen = recovered_numbers(target, read, weights)
+    return {name: seen[name] for name in ("ver", "wmae", "psnr", "ssim")}
 
 
 def region_vertices(rig: Rig) -> dict[str, Int[Tensor, "N"]]:

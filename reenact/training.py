@@ -35,7 +35,7 @@ from reenact.losses import VertexDistance, weight_distance
 from reenact.models import Networks
 from reenact.pairs import Teacher
 from reenact.preview import save_preview
-from reenact.run import Run, restore_networks
+from reenact.run import MOST_VERTICES, Run, restore_networks
 
 _PICTURES_PER_COMPONENT = 6
 """Pictures of each rig, per principal component, from which networks learn what varies before any training."""
@@ -199,7 +199,11 @@ def _find_teachers(run: Run, studios: dict[str, Studio], console: Console) -> di
         return {}
     teachers, words = {}, {}
     if run.config.pairs.method == "geometry" and not run.correspondences:
-        console.print("The surfaces are too large to register in minutes: pictures alone tell which shapes are one")
+        console.print(
+            f"A rig has more than {MOST_VERTICES:,} vertices, too many to register: pictures alone tell which shapes "
+            "are one; give pairs of places with --pairs.correspondence for more",
+            soft_wrap=True,
+        )
     for source in studios:
         for target in studios:
             if source == target:
@@ -337,10 +341,8 @@ def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Genera
 
 def _weight_losses(shop: _Workshop, key: str, predicted: Tensor, weights: Tensor) -> Tensor:
     """(N,), how wrong predicted weights are: L_w of KI21, and by how far they move the vertices (ours)."""
-    bpnet = shop.config.bpnet
-    return bpnet.weight_loss * weight_distance(predicted, weights) + bpnet.vertex_loss * shop.vertex_distances[key](
-        predicted, weights
-    )
+    bpnet, moved = shop.config.bpnet, shop.vertex_distances[key](predicted, weights)
+    return bpnet.weight_loss * weight_distance(predicted, weights) + bpnet.vertex_loss * moved
 
 
 def _image_loss(shop: _Workshop, key: str, predicted: Tensor, described: Tensor) -> Tensor:
