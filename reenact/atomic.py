@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -12,13 +14,23 @@ def write_atomically(path: Path | str, data: bytes) -> None:
     Raises:
         OSError: As the system says; nothing is left behind.
     """
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        file.write(data)
+
+
+@contextmanager
+def replacing(path: Path | str) -> Iterator[Path]:
+    """A name beside the file to write to; what lies there at the end of the block takes the file's place.
+
+    Raises:
+        OSError: As the system says; nothing is left behind.
+    """
     path = Path(path)
     # Beside the target: a rename stays on one disk. Cut short: the longest name that a disk takes may be the target's.
     temporary = path.with_name(f".{path.name[:50]}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "wb") as file:
-            file.write(data)
-            file.flush()
+        yield temporary
+        with open(temporary, "rb+") as file:
             os.fsync(file.fileno())  # without it a power cut may keep the new name and lose the content
         os.replace(temporary, path)
     except BaseException:

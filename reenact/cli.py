@@ -1,4 +1,4 @@
-"""The commands: reenact train | infer | evaluate | convert | inspect | rigs."""
+"""The commands: reenact train | infer | evaluate | view | render | convert | inspect | rigs."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rich.console import Console
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from tyro.extras import subcommand_cli_from_dict
 
-from reenact.config import Config, PostConfig, changed_keys, check_config, load_config
+from reenact.config import Config, PostConfig, changed_settings, check_config, load_config
 from reenact.errors import ReenactError
 
 # PyTorch's threads wait for work by spinning, and would take the cores from the renderer's threads, which run between
@@ -58,7 +58,7 @@ def train(
         if settings.run is None:
             raise ReenactError("--resume: expected the folder of a run beside it, got none; add --run DIR")
         saved = load_config(_run_config(settings.run))
-        changed = changed_keys(saved, replace(settings, run=saved.run))
+        changed = changed_settings(saved, replace(settings, run=saved.run))
         if changed:
             raise ReenactError(
                 f"{settings.run}: expected the settings that the run began with, got other {', '.join(changed)}; "
@@ -120,7 +120,7 @@ def infer(
         from reenact.inference import ImageRetargeter
 
         retargeter: Any = ImageRetargeter.load(inputs[0], reverse=reverse)
-        names = [retargeter.config.source, retargeter.config.target][:: -1 if reverse else 1]
+        names = [retargeter.run.config.source, retargeter.run.config.target][:: -1 if reverse else 1]
         moved = _moved(retargeter, inputs[-1])
     else:
         moved, retargeter, names = _geometric(inputs, method, source, target, correspondence, training, reverse)
@@ -139,11 +139,15 @@ def evaluate(
     *,
     frames: int = 600,
     seed: int = 0,
-    suite: Literal["geometric"] | None = None,
+    suite: Literal["geometric", "transfer"] | None = None,
     rigs: Annotated[tuple[str, ...], arg(metavar="RIG")] = (),
     methods: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
+    configs: Annotated[tuple[Path, ...], arg(metavar="FILE.toml")] = (),
+    targets: Annotated[tuple[str, ...], arg(metavar="RIG")] = (),
     seeds: int = 3,
-    json: Annotated[Path | None, arg(metavar="FILE.json")] = None,
+    take: Annotated[Path | None, arg(metavar="CLIP")] = None,
+    results: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None,
+    keep: Annotated[Path | None, arg(metavar="FOLDER")] = None,
 ) -> None:
     """Measure trained runs on clips that they have not seen, and write a report.
 
@@ -153,15 +157,20 @@ def evaluate(
         runs: Folders that `reenact train` wrote.
         frames: Frames to measure on, in all.
         seed: Of the clips; the same seed gives every run on the same rigs the same clips.
-        suite: Instead of runs: every geometric method from anny:man to the other built-in characters, by
-            correspondences that are found, on held-out clips.
+        suite: Instead of runs, from anny:man to the other built-in characters: `geometric`, every geometric method by
+            correspondences that are found; `transfer`, those and networks, trained by each of --configs.
         rigs: Files of further rigs for the suite, there and back.
-        methods: Only these of the suite.
-        seeds: How many seeds of clips the suite takes, from --seed on.
-        json: Write the suite's rows here.
+        methods: Only these geometric methods of the suite; the word none leaves them out.
+        configs: Settings of networks for the suite.
+        targets: Only these built-in characters; the word none leaves them out.
+        seeds: How many seeds of clips and training the suite takes, from --seed on.
+        take: A recorded clip of ARKit shapes, measured as well.
+        results: Finished cells of the suite: they are not made again, new ones are appended.
+        keep: Keep the runs of the suite in this folder.
     """
     if suite is not None:
-        _run_suite(rigs, methods, frames, range(seed, seed + seeds), json)
+        chosen = tuple(configs) if suite == "transfer" else ()
+        _run_suite(rigs, targets, methods, chosen, frames, range(seed, seed + seeds), take, results, keep)
         return
     if not runs:
         raise ReenactError("evaluate: expected at least one run folder, got none; name the folders after the command")
@@ -177,6 +186,84 @@ def evaluate(
         for table in _tables(results[-1]):
             console.print(table)
     console.print(f"Report: {write_report(list(runs), results)}", highlight=False, soft_wrap=True)
+
+
+def view(
+    inputs: Annotated[Positional[tuple[str, ...]], arg(metavar="RUN|RIG [RIG ...]", help_behavior_hint="")],
+    *,
+    clip: Annotated[str | None, arg(metavar="CLIP")] = None,
+    method: Annotated[str | None, arg(metavar="NAME")] = None,
+    audio: Annotated[Path | None, arg(metavar="FILE.wav")] = None,
+    nudges: Annotated[Path | None, arg(metavar="FILE.json")] = None,
+    fps: float | None = None,
+    port: int = 0,
+    browser: bool = True,
+) -> None:
+    """Show rigs and their motion in the browser, and correct it there.
+
+    A page of this machine: the clip plays on the source and on every target, by any method, with sliders for all
+    shapes. Nothing leaves the machine. Ctrl-C ends it. docs/viewer.md tells what the page can do.
+
+    Args:
+        inputs: The folder that `reenact train` wrote, or rigs, the source first: built-in names or files.
+        clip: Motion of the source; what the source's file holds unless said, or ten seconds that are made up.
+        method: Shown first on the targets; the run's networks unless said, else what names tell, else shape-matching.
+        audio: Sound that plays along.
+        nudges: Where corrections are kept; RUN/nudges.json unless said, and nowhere without a run.
+        fps: Frames per second to play at; those of the clip unless said.
+        port: Of the page's address; any free one unless said.
+        browser: Open the page.
+    """
+    if nudges is not None:
+        _check_out(nudges, (".json",))
+    from reenact.viewer.server import serve
+    from reenact.viewer.session import Session
+
+    with Console(stderr=True).status("Loading"):
+        session = Session.open(inputs, clip, method, audio, nudges, fps)
+    serve(session, port, browser)
+
+
+def render(
+    inputs: Annotated[Positional[tuple[str, ...]], arg(metavar="[RUN] CLIP", help_behavior_hint="")],
+    *,
+    out: Annotated[Path, arg(metavar="OUT")],
+    rig: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="RIG", help_behavior_hint="(repeatable)")] = (),
+    method: Annotated[str | None, arg(metavar="NAME")] = None,
+    size: int = 512,
+    fps: float | None = None,
+    audio: Annotated[Path | None, arg(metavar="FILE.wav")] = None,
+    opengl: Annotated[bool, FlagCreatePairsOff] = False,
+) -> None:
+    """Write a film of a clip: an .mp4, a .gif or pictures of one or more rigs, side by side.
+
+    Args:
+        inputs: A clip; or the folder that `reenact train` wrote, with a clip of its source or ten seconds that are made
+            up: the source and the target that follows.
+        out: File to write, .mp4 or .gif, or a new folder for PNGs.
+        rig: Who plays the clip, by the names of the shapes; again for another beside it. The rig in the clip's own file
+            unless said.
+        method: Retarget from the first rig to the others instead; with a run, in place of its networks.
+        size: Height and width of each rig in pixels.
+        fps: Frames per second; those of the clip unless said.
+        audio: Sound for the .mp4.
+        opengl: Draw through pyrender, for large pictures.
+    """
+    if not 16 <= size <= 4096:
+        raise ReenactError(f"--size: expected 16 to 4096 pixels, got {size}")
+    from rich.progress import Progress
+
+    from reenact.video import check_out, performances, save_video
+
+    check_out(out, audio)
+    console = Console(stderr=True)
+    with console.status("Loading"):
+        played = performances(inputs, rig, method, fps)
+    clip = played[0].clip
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("Drawing", total=len(clip))
+        save_video(played, out, size, opengl, audio, lambda done: progress.update(task, completed=done))
+    print(f"{out}: {len(clip)} frames, {clip.duration:.1f} s, {', '.join(each.rig.name for each in played)}")
 
 
 def convert(
@@ -304,6 +391,8 @@ COMMANDS = {
     "train": train,
     "infer": infer,
     "evaluate": evaluate,
+    "view": view,
+    "render": render,
     "convert": convert,
     "inspect": inspect,
     "rigs": rigs,
@@ -362,29 +451,50 @@ def _train_defaults(arguments: list[str]) -> Config:
 
 
 def _run_suite(
-    rigs: tuple[str, ...], methods: tuple[str, ...], frames: int, seeds: Sequence[int], json: Path | None
+    rigs: tuple[str, ...],
+    targets: tuple[str, ...],
+    methods: tuple[str, ...],
+    configs: tuple[Path, ...],
+    frames: int,
+    seeds: Sequence[int],
+    take: Path | None,
+    results: Path | None,
+    keep: Path | None,
 ) -> None:
-    from dataclasses import asdict
-    from json import dumps
-
-    from reenact.atomic import write_atomically
     from reenact.retargeting import METHODS
-    from reenact.suite import TARGETS, run_suite, table
+    from reenact.suite import TARGETS, run_suite, table, versions
 
-    if json is not None:
-        _check_out(json, (".json",))
-    pairs = [("anny:man", name) for name in TARGETS]
+    if results is not None:
+        _check_out(results, (".jsonl",))
+    pairs = [("anny:man", name) for name in targets or TARGETS if name != "none"]
     pairs += [pair for name in rigs for pair in (("anny:man", name), (name, "anny:man"))]
     console = Console(markup=False, emoji=False, highlight=False)
     with console.status("") as status:
-        rows = run_suite(pairs, methods or tuple(METHODS), frames, tuple(seeds), say=status.update)
-    for key in ("ver", "ver_mouth", "ver_eyes", "ver_brows", "lips.contact_f1", "lids.blink_f1", "wmae", "jitter"):
-        console.print(f"\n{table(rows, key)}", soft_wrap=True)
-    for row in rows:
-        if row.failed:
-            console.print(f"{row.method}: {row.failed}", soft_wrap=True)
-    if json is not None:
-        write_atomically(json, dumps([asdict(row) for row in rows], indent=1).encode())
+        cells = run_suite(
+            pairs,
+            tuple(name for name in methods or tuple(METHODS) if name != "none"),
+            frames,
+            tuple(seeds),
+            say=status.update,
+            configs={path.stem: load_config(path) for path in configs},
+            take=None if take is None else str(take),
+            results=results,
+            runs=keep,
+        )
+    for key in _SUITE_NUMBERS:
+        console.print(f"\n{table(cells, key)}", soft_wrap=True)
+    console.print(f"\n{versions(cells)}", soft_wrap=True)
+    for cell in cells:
+        if cell.failed:
+            console.print(f"{cell.method}: {cell.failed}", soft_wrap=True)
+
+
+_SUITE_NUMBERS = (
+    *("ver", "ver_mouth", "ver_eyes", "ver_brows", "wmae", "correlation", "gain", "jitter"),
+    *("lips.contact_f1", "lids.blink_f1", "single.right", "single.elsewhere", "take.ver", "take.jitter"),
+    *("cyclic.mae", "cyclic.ssim", "cyclic.skill", "cyclic.skill_masked"),
+)
+"""Tables that a suite prints; see `reenact.suite.measure`."""
 
 
 def _moved(retargeter: Any, clip: str) -> Clip:

@@ -37,8 +37,10 @@ class ImageConfig:
 class LayoutConfig:
     """One 2-D warp per rig that puts its eyes, mouth and outline on the pixels of the source's."""
 
-    method: Literal["found", "none"] = "found"
-    """`found` registers neutral pictures, part maps and motion energy; `none` leaves the pictures as framed."""
+    method: Literal["found", "pictures", "none"] = "found"
+    """`pictures` registers neutral pictures, part maps and motion energy; `found` does so where no correspondence
+    between the surfaces is known (see `pairs.method`), and follows that otherwise; `none` leaves the pictures as
+    framed."""
     grid: int = 9
     """Control points along each side of the displacement grid."""
     steps: int = 120
@@ -51,13 +53,19 @@ class LayoutConfig:
 
 @dataclass(frozen=True)
 class PairsConfig:
-    """Which shapes of two rigs do the same, found by what they look like; see `reenact.pairs`."""
+    """What is known of expressions of one rig on the other before any training; see `reenact.pairs`."""
 
-    method: Literal["found", "none"] = "found"
-    """`found` compares the motion passes of single shapes and trains on the pairs that both rigs agree on; `none`
-    leaves the networks to what they share by themselves."""
+    method: Literal["geometry", "pictures", "none"] = "geometry"
+    """`geometry` finds places of the two surfaces that belong together and lets geometric methods label expressions,
+    with the help of pictures (of rigs of more than 50,000 vertices, pictures alone); `pictures` compares the motion
+    passes of single shapes, and needs no meshes beyond the renderer; `none` leaves the networks to what they share by
+    themselves."""
+    correspondence: str | None = None
+    """A file of pairs of places, source and target; None finds them."""
+    markers: int = 300
+    """Pairs of places that are found."""
     similarity: float = 0.3
-    """Least correlation of the motion passes of two shapes that count as one."""
+    """Least correlation of the motion passes of two shapes that count as one in pictures."""
     margin: float = 0.05
     """By how much the next best shape must correlate less."""
 
@@ -71,7 +79,7 @@ class ReenactNetConfig:
     family."""
     code: int = 256
     """Size of the bottleneck. Far larger ones let identity leak into the code."""
-    components: int = 256
+    components: int = 512
     """Principal components of what is read from a rig's pictures."""
     color_components: int = 128
     """Principal components of the colours that are drawn beside the motion pass."""
@@ -127,8 +135,8 @@ class BPNetConfig:
 class TrainingConfig:
     """Optimization of ReenactNet, and what both networks share."""
 
-    steps: int = 4000
-    """Optimizer steps of ReenactNet."""
+    steps: int = 5000
+    """Optimizer steps; of ReenactNet alone where it is trained first."""
     epochs: float | None = None
     """Passes over the `frames` pictures, where they are never refreshed; None counts in `steps`."""
     batch_size: int = 64
@@ -138,8 +146,13 @@ class TrainingConfig:
     loss: Literal["l1", "l1+l2"] = "l1+l2"
     """Convolutional: distance of redrawn pictures, the published L1, or L1 plus squares. Residuals are nearly all
     zeros, and L1 alone takes thousands of steps to leave the zero picture."""
+    together: bool = True
+    """Train ReenactNet and every BPNet in one stage; the published method trains them one after the other."""
     pair_loss: float = 1.0
     """Factor of the distance between what is drawn of the other rig's paired picture and the pair."""
+    read_loss: float = 1.0
+    """Together: factor of the error of the weights that BPNet reads from what ReenactNet draws of the other rig's
+    picture. It reaches back into ReenactNet, which learns to draw what is read right."""
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
     """How the learning rate changes over the steps."""
     optimizer: Literal["adamw", "adam"] = "adamw"
@@ -151,11 +164,11 @@ class TrainingConfig:
     Helps where no pairs teach it to overlook how faces differ."""
     motion_weighting: bool = True
     """Convolutional: weight the reconstruction by where each rig's pictures move."""
-    crowded: float = 0.0
+    crowded: float = 0.3
     """Share of random expressions that move any number of shapes, up to all, more weakly, as recorded faces do."""
-    frames: int = 8192
+    frames: int = 6144
     """Rendered expressions of each rig that are in memory at a time."""
-    refresh: int = 2000
+    refresh: int = 2500
     """Steps after which fresh expressions replace them; 0 keeps the first."""
     seed: int = 0
     """Seed of every random number in the run."""
@@ -266,9 +279,9 @@ def config_from_dict(table: dict[str, Any], origin: str = "settings") -> Config:
     return _build(Config, table, origin, prefix="")
 
 
-def changed_keys(old: Config, new: Config) -> list[str]:
-    """Dotted names of the settings whose values differ."""
-    return [key for (key, value), (_, other) in zip(_leaves(old), _leaves(new), strict=True) if value != other]
+def changed_settings(old: Config, new: Config) -> dict[str, Any]:
+    """Dotted names of the settings whose values differ, with the new values."""
+    return {key: other for (key, value), (_, other) in zip(_leaves(old), _leaves(new), strict=True) if value != other}
 
 
 def check_config(config: Config, origin: str = "settings") -> None:
@@ -297,10 +310,10 @@ def check_config(config: Config, origin: str = "settings") -> None:
                 f"{origin}: {section}.epochs: expected training.refresh = 0 beside it, got {config.training.refresh}; "
                 "epochs are passes over pictures that stay the same"
             )
-    if config.pairs.method == "found" and not config.images.motion:
+    if config.pairs.method == "pictures" and not config.images.motion:
         raise ReenactError(
-            f'{origin}: pairs.method: expected images.motion beside "found", got none; colours alone pair the wrong '
-            'shapes, set pairs.method to "none"'
+            f'{origin}: pairs.method: expected images.motion beside "pictures", got none; colours alone pair the wrong '
+            'shapes, set pairs.method to "geometry" or "none"'
         )
     if config.images.motion and not config.images.residual:
         raise ReenactError(
@@ -324,6 +337,7 @@ _ALLOWED: dict[str, _Rule] = {
     "layout.steps": _ONE_OR_MORE,
     "layout.bending": _NOT_NEGATIVE,
     "layout.samples": _ONE_OR_MORE,
+    "pairs.markers": ("a whole number from 50 to 5,000", lambda value: 50 <= value <= 5000),
     "pairs.similarity": _FRACTION,
     "pairs.margin": _FRACTION,
     "reenactnet.code": _ONE_OR_MORE,
@@ -351,6 +365,7 @@ _ALLOWED: dict[str, _Rule] = {
     "training.weight_decay": _NOT_NEGATIVE,
     "training.elastic": _FRACTION,
     "training.pair_loss": _NOT_NEGATIVE,
+    "training.read_loss": _NOT_NEGATIVE,
     "training.crowded": _FRACTION,
     "training.frames": ("a whole number from 8 to 1,000,000", lambda value: 8 <= value <= 1_000_000),
     "training.refresh": ("a whole number of at least 0", lambda value: value >= 0),

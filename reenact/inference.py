@@ -14,11 +14,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reenact.config import Config
 from reenact.data import Studio
 from reenact.errors import ReenactError
 from reenact.models import Networks
-from reenact.pairs import Pairs, find_pairs
+from reenact.pairs import Teacher
 from reenact.rigs.clip import Clip
 from reenact.run import Run
 
@@ -29,9 +28,9 @@ _CHUNK = 64
 class ImageRetargeter:
     """Moves motion from `source` to `target` through a shared picture space."""
 
-    def __init__(self, config: Config, source: Studio, target: Studio, networks: Networks, keys: tuple[str, str]):
+    def __init__(self, run: Run, source: Studio, target: Studio, networks: Networks, keys: tuple[str, str]):
         """`source` and `target` must be studios of the run that trained the networks, `keys` their keys; see `load`."""
-        self.config = config
+        self.run = run
         self.source, self.target = source.rig, target.rig
         self.source_studio, self.target_studio = source, target
         self.networks, self.keys = networks, keys
@@ -47,7 +46,7 @@ class ImageRetargeter:
         run = Run.open(folder)
         networks = run.trained_networks()
         source, target = run.keys[:2][::-1] if reverse else run.keys[:2]
-        return cls(run.config, run.studio(source), run.studio(target), networks, (source, target))
+        return cls(run, run.studio(source), run.studio(target), networks, (source, target))
 
     @torch.inference_mode()
     def __call__(self, clip: Clip) -> Clip:
@@ -106,14 +105,14 @@ class ImageRetargeter:
 
     @torch.inference_mode()
     def paired(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"] | None:
-        """The target's weights by the pairs of shapes that training learnt from, without any network; None if none.
+        """The target's weights as the networks were taught, without any network; None if nobody taught them.
 
         Where every shape has its partner this is copying by look, which a network that learns from it cannot beat.
         """
-        if self.config.pairs.method == "none":
+        if self.run.config.pairs.method == "none":
             return None
-        return self._pairs.weights(weights)
+        return self._teacher.weights(weights)
 
     @cached_property
-    def _pairs(self) -> Pairs:
-        return find_pairs(self.source_studio, self.target_studio, self.config.pairs)
+    def _teacher(self) -> Teacher:
+        return self.run.teacher(self.source_studio, self.target_studio, *self.keys)

@@ -4,7 +4,8 @@ Ours. A shared encoder reads place before it reads meaning: where two faces have
 keeps two codes for one expression. A single warp of every picture of the target, found once from pictures of both rigs,
 takes that difference away. Nothing here sees paired expressions, blendshape names or mesh topology: what is registered
 are the neutral pictures (camera-space normals, mask), the maps of face parts, and the motion energy, where and how
-strongly random expressions of each rig change its pictures.
+strongly random expressions of each rig change its pictures. Where a correspondence between the surfaces is known,
+`lay_out` makes the warp from that, twice as exactly.
 """
 
 from __future__ import annotations
@@ -14,12 +15,15 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from kornia.filters import gaussian_blur2d
+from scipy.interpolate import RBFInterpolator
 from torch import Tensor
 
 from reenact.config import LayoutConfig
 from reenact.data import identity_grid, warp
 from reenact.errors import ReenactError
+from reenact.geometry import vertex_normals
 from reenact.portrait import Portrait, made_up
+from reenact.retargeting.correspondence import Correspondence
 from reenact.rigs import motion
 from reenact.rigs.rig import PARTS, Rig
 
@@ -68,6 +72,49 @@ def find_layout(
             loss.backward()
             optimizer.step()
     return (base + _displacement(control.detach(), resolution)).detach()
+
+
+_FACING = 0.2
+"""Cosine with the viewing direction from which a place of the surface counts as seen."""
+_SMOOTHING = 1.0
+"""How far the warp may miss pairs of places, which are found one by one; squared pixels of 64, about."""
+
+
+def lay_out(
+    source: Rig, target: Rig, correspondence: Correspondence, resolution: int
+) -> Float[Tensor, "{resolution} {resolution} 2"]:
+    """The sampling grid that warps pictures of the target onto the layout of the source, from pairs of places. Ours.
+
+    A thin-plate spline through where both rigs' pictures show the pairs that face the camera in both.
+
+    Args:
+        source: Its pictures stay where they are.
+        target: Its pictures are warped.
+        correspondence: From the source's surface to the target's.
+        resolution: Pixels along each side of the pictures.
+
+    Raises:
+        ReenactError: Fewer than ten pairs face the camera, or a rig cannot be photographed.
+    """
+    places = ((source, correspondence.source), (target, correspondence.target))
+    here, there = (Portrait.of(rig).project(each.of(rig.neutral), 64) for rig, each in places)
+    facing = [each.of(vertex_normals(rig.neutral, rig.faces))[:, 2] > _FACING for rig, each in places]
+    seen = facing[0] & facing[1] & ((here > -16) & (here < 80)).all(1)  # a quarter beyond the picture, for its rim
+    if int(seen.sum()) < 10:
+        raise ReenactError(
+            f"{source.name} to {target.name}: expected ten pairs of places that face the camera, got "
+            f'{int(seen.sum())}; give more with pairs.correspondence, or set layout.method to "pictures"'
+        )
+    moved = RBFInterpolator(
+        here[seen].double().numpy(),
+        (there - here)[seen].double().numpy(),
+        kernel="thin_plate_spline",
+        smoothing=_SMOOTHING,
+    )
+    grid = identity_grid(resolution)
+    pixels = (grid + 1) * 32
+    displacement = torch.from_numpy(moved(pixels.flatten(0, 1).double().numpy())).float()
+    return grid + displacement.unflatten(0, grid.shape[:2]) / 32
 
 
 def _features(

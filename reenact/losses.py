@@ -13,9 +13,9 @@ from torch import Tensor
 from reenact.rigs.rig import Rig
 
 
-def weight_distance(a: Float[Tensor, "B K"], b: Float[Tensor, "B K"]) -> Float[Tensor, ""]:
-    """Mean absolute difference of blendshape weights. Source: KI21, L_w."""
-    return (a - b).abs().mean()
+def weight_distance(a: Float[Tensor, "B K"], b: Float[Tensor, "B K"]) -> Float[Tensor, "B"]:
+    """Mean absolute difference of blendshape weights, of each expression. Source: KI21, L_w."""
+    return (a - b).abs().mean(1)
 
 
 class VertexDistance:
@@ -32,6 +32,6 @@ class VertexDistance:
         values, vectors = torch.linalg.eigh(gram / typical)
         self.root = (vectors * values.clamp_min(0).sqrt()).float()  # gram = root root^T
 
-    def __call__(self, a: Float[Tensor, "B K"], b: Float[Tensor, "B K"]) -> Float[Tensor, ""]:
+    def __call__(self, a: Float[Tensor, "B K"], b: Float[Tensor, "B K"]) -> Float[Tensor, "B"]:
         """0 for equal expressions; 1 when the error is as large as the typical motion."""
-        return torch.linalg.vector_norm((a - b) @ self.root, dim=1).mean()
+        return torch.linalg.vector_norm((a - b) @ self.root, dim=1)

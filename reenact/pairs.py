@@ -6,6 +6,9 @@ other's best match, and clearly so: what only one side claims is not believed. N
 paired expressions. A shape at full strength is taken to mean its partner at full strength, whatever the distance that
 either moves (the "range of motion" of Ribera et al. 2017); shapes without a partner become the mixture of the other
 rig's shapes that comes closest, amplitudes and all.
+
+`Teacher` joins these pairs with the labels that geometry gives (`reenact.retargeting.labels`), where a correspondence
+between the meshes is found.
 """
 
 from __future__ import annotations
@@ -19,6 +22,9 @@ from torch import Tensor
 
 from reenact.config import PairsConfig
 from reenact.data import Studio
+from reenact.errors import ReenactError
+from reenact.retargeting.correspondence import Correspondence
+from reenact.retargeting.labels import Labels
 
 
 @dataclass(frozen=True)
@@ -42,6 +48,69 @@ class Pairs:
         """How far to believe the weights of each expression: mean squared similarity of its shapes, by their motion."""
         moved = source_weights * self.strength
         return (moved @ self.similarity.square()) / moved.sum(1).clamp_min(1e-12)
+
+
+@dataclass(frozen=True)
+class Teacher:
+    """What networks are taught of one rig's expressions on another; at least one of its two sources is there. Ours."""
+
+    pictures: Pairs | None
+    """Shapes that look alike."""
+    geometry: Labels | None
+    """Shapes that move corresponding places alike."""
+
+    @property
+    def agreed(self) -> tuple[tuple[int, int], ...]:
+        """Shapes that are taken to be one: source shape, target shape."""
+        return self.pictures.agreed if self.geometry is None else self.geometry.partners
+
+    def weights(self, source_weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"]:
+        """Weights of the target for expressions of the source, in [0, 1].
+
+        Those of geometry, alone where its shapes pair off. Where they do not, all that either knows is how far things
+        move, and their mistakes have nothing in common: pictures join the mean, by the fourth power of the confidence
+        in them, which leaves them out where the target cannot look like the source. (The power was chosen on
+        `anny:merged` and `anny:units`.)
+        """
+        if self.geometry is None:
+            return self.pictures.weights(source_weights)
+        told = self.geometry.weights(source_weights)
+        if self.pictures is None or self.geometry.partners:
+            return told
+        trust = self.pictures.confidence(source_weights).pow(4)[:, None]
+        return (told + trust * self.pictures.weights(source_weights)) / (1 + trust)
+
+    def confidence(
+        self, source_weights: Float[Tensor, "N Ks"], weights: Float[Tensor, "N Kt"] | None = None
+    ) -> Float[Tensor, "N"]:
+        """How far to believe the weights of each expression, in [0, 1]; `weights` are those, where they are at hand."""
+        if self.geometry is None:
+            return self.pictures.confidence(source_weights)
+        return self.geometry.confidence(source_weights, weights)
+
+
+def find_teacher(
+    source: Studio, target: Studio, config: PairsConfig, correspondence: Correspondence | None = None
+) -> Teacher:
+    """What is known of the source's expressions on the target before any training.
+
+    Args:
+        source: Studio of the rig that motion comes from.
+        target: Studio of the rig that it goes to, in the same layout.
+        config: What to learn from; anything but "none".
+        correspondence: From the source's surface to the target's, for "geometry"; pictures teach alone without.
+
+    Raises:
+        ReenactError: The correspondence belongs to other rigs, or there is neither it nor a motion pass.
+    """
+    pictures = find_pairs(source, target, config) if "motion" in source.buffers else None
+    geometry = None if correspondence is None else Labels(source.rig, target.rig, correspondence)
+    if pictures is None and geometry is None:
+        raise ReenactError(
+            f"{source.rig.name} to {target.rig.name}: expected a correspondence, or images.motion, to learn from; the "
+            'surfaces are too large to register: give pairs.correspondence, or set pairs.method to "none"'
+        )
+    return Teacher(pictures, geometry)
 
 
 @torch.no_grad()

@@ -95,7 +95,7 @@ def write_report(
 def verdict(result: dict[str, Any]) -> str:
     """A paragraph for someone who has never heard of the numbers: how good, against what, and where it is lost."""
     source, target, truth = result["source"], result["target"], result.get("truth")
-    opening = f"This run learned to move expressions from {source} to {target} from unpaired pictures of both. "
+    opening = f"This run learned to move expressions from {source} to {target} without paired examples. "
     skill = result["cyclic"]["skill"]
     if truth is None or truth["ver"] is None:
         return opening + (
@@ -129,7 +129,7 @@ def verdict(result: dict[str, Any]) -> str:
     paired = ((result.get("paired") or {}).get("truth") or {}).get("ver")
     if paired is not None:
         parts.append(
-            f"The pairs of shapes that training found reach {paired:.2f} without any network"
+            f"The labels that taught the networks reach {paired:.2f} without any network"
             + (": on these rigs, copying by look is better. " if paired < ver else ". ")
         )
     floor = result["bpnet"]["ver"]
@@ -227,10 +227,12 @@ def _facts(folder: Path, result: dict[str, Any]) -> list[tuple[str, str]]:
     config = folder / "config.toml"
     if config.is_file():
         settings = tomllib.loads(config.read_text(encoding="utf-8"))
+        together = settings.get("training", {}).get("together", False)
         for title, section, key in (
             ("pixels", "images", "resolution"),
-            ("ReenactNet steps", "training", "steps"),
-            ("BPNet steps", "bpnet", "steps"),
+            ("steps", "training", "steps"),
+            *([] if together else [("BPNet steps", "bpnet", "steps")]),
+            ("labels", "pairs", "method"),
             ("layout", "layout", "method"),
             ("training seed", "training", "seed"),
         ):
@@ -246,7 +248,7 @@ def _methods(result: dict[str, Any]) -> list[dict[str, Any]]:
     rows = [
         ("this run", {"truth": result.get("truth"), "cyclic": result["cyclic"]}),
         ("without ReenactNet", result["direct"]),
-        *([("pairs of shapes alone, no network", result["paired"])] if result.get("paired") else []),
+        *([("the labels that taught it, no network", result["paired"])] if result.get("paired") else []),
         *((_BASELINES[name], result["baselines"][name]) for name in _BASELINES),
     ]
     return [{"title": title, "width": _width(row["truth"]), **row} for title, row in rows]

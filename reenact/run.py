@@ -4,6 +4,7 @@ config.toml          every setting, resolved
 rigs/0-man.npz ...   the rigs as they were; the first is the source, whose layout all others share
 clips/0-man.npz ...  training motion of the rigs that were given some
 layouts.safetensors  sampling grid of each other rig
+correspondences/     pairs of places of the source's surface and each other rig's, where geometry teaches
 pairs.json           which shapes of the rigs were found to do the same
 metrics.jsonl        losses by stage and step
 checkpoints/         networks, optimizer, position; see `reenact.checkpoint`
@@ -25,14 +26,24 @@ from reenact.checkpoint import load_checkpoint, load_tensors, save_tensors
 from reenact.config import Config, load_config, save_config
 from reenact.data import Studio
 from reenact.errors import ReenactError
-from reenact.layout import find_layout
+from reenact.layout import find_layout, lay_out
 from reenact.models import Networks
+from reenact.pairs import Teacher, find_teacher
+from reenact.retargeting.correspondence import (
+    Correspondence,
+    find_correspondence,
+    load_correspondence,
+    save_correspondence,
+)
 from reenact.rigs.files import load_clip, load_rig, save_clip, save_rig
 from reenact.rigs.formats.pieces import Choice
 from reenact.rigs.rig import Rig
 
 _LAYOUT_RESOLUTION = 64
 """Pixels at which layouts are found; a studio enlarges them to the resolution of its pictures."""
+MOST_VERTICES = 50_000
+"""Of rigs whose surfaces are registered, unless pairs are given. With 100,000 a quarter of an hour was not enough.
+Beyond, pictures teach alone."""
 _FILE = re.compile(r"(\d+)-(.+)\.npz")
 
 
@@ -45,6 +56,8 @@ class Run:
     rigs: dict[str, Rig]
     layouts: dict[str, Tensor]
     """(R, R, 2) sampling grid of each rig but the first; empty where the settings ask for none."""
+    correspondences: dict[tuple[str, str], Correspondence]
+    """By pair of keys, the earlier first; empty where the settings ask for none."""
 
     @classmethod
     def create(cls, config: Config) -> Run:
@@ -80,7 +93,11 @@ class Run:
                 if clip is not None:
                     (whole / "clips").mkdir(exist_ok=True)
                     save_clip(clip, whole / "clips" / f"{index}-{key}.npz")
-            layouts = _find_layouts(keyed, config)
+            correspondences = _find_correspondences(keyed, config)
+            for (first, second), correspondence in correspondences.items():
+                (whole / "correspondences").mkdir(exist_ok=True)
+                save_correspondence(correspondence, whole / "correspondences" / _pair_file(list(keyed), first, second))
+            layouts = _find_layouts(keyed, correspondences, config)
             save_tensors(layouts, whole / "layouts.safetensors")
             save_config(config, whole / "config.toml")
             # A run appears whole or not at all: by one rename, or with its config, without which it is none, last.
@@ -89,7 +106,7 @@ class Run:
                     part.replace(place / part.name)
             else:
                 whole.replace(place)
-        return cls(folder, config, keyed, layouts)
+        return cls(folder, config, keyed, layouts, correspondences)
 
     @classmethod
     def open(cls, folder: Path | str) -> Run:
@@ -104,7 +121,8 @@ class Run:
             raise FileNotFoundError(f"{folder}: expected a run folder with config.toml; train one with `reenact train`")
         config = replace(load_config(folder / "config.toml"), run=str(folder))
         rigs = _load_rigs(folder / "rigs")
-        return cls(folder, config, rigs, _load_layouts(folder / "layouts.safetensors", config, list(rigs)))
+        layouts = _load_layouts(folder / "layouts.safetensors", config, list(rigs))
+        return cls(folder, config, rigs, layouts, _load_correspondences(folder / "correspondences", config, rigs))
 
     @property
     def keys(self) -> list[str]:
@@ -129,6 +147,19 @@ class Run:
             seed=1000 * config.training.seed + index,
             crowded=config.training.crowded,
         )
+
+    def teacher(self, source: Studio, target: Studio, source_key: str, target_key: str) -> Teacher:
+        """What is known of one rig's expressions on another; the settings must ask for pairs.
+
+        Args:
+            source: Studio of `source_key`.
+            target: Studio of `target_key`.
+            source_key: Where motion comes from.
+            target_key: Where it goes to.
+        """
+        there = self.correspondences.get((source_key, target_key))
+        back = self.correspondences.get((target_key, source_key))
+        return find_teacher(source, target, self.config.pairs, back.reversed() if there is None and back else there)
 
     def networks(self) -> Networks:
         """Untrained networks of the run's shape, initialised from its seed."""
@@ -177,13 +208,57 @@ def networks_state(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
-def _find_layouts(rigs: dict[str, Rig], config: Config) -> dict[str, Tensor]:
+def _find_layouts(
+    rigs: dict[str, Rig], correspondences: dict[tuple[str, str], Correspondence], config: Config
+) -> dict[str, Tensor]:
     """A layout for each rig but the first; none at all where the settings say so."""
     if config.layout.method == "none":
         return {}
     reference, *others = rigs
-    seed = config.training.seed
-    return {key: find_layout(rigs[reference], rigs[key], _LAYOUT_RESOLUTION, config.layout, seed) for key in others}
+    layouts = {}
+    for key in others:
+        known = correspondences.get((reference, key))
+        if config.layout.method == "found" and known is not None:
+            layouts[key] = lay_out(rigs[reference], rigs[key], known, _LAYOUT_RESOLUTION)
+        else:
+            layouts[key] = find_layout(
+                rigs[reference], rigs[key], _LAYOUT_RESOLUTION, config.layout, config.training.seed
+            )
+    return layouts
+
+
+def _find_correspondences(rigs: dict[str, Rig], config: Config) -> dict[tuple[str, str], Correspondence]:
+    """Between all pairs of rigs, where the settings let geometry teach."""
+    found, given = {}, config.pairs.correspondence
+    for first, second in _registered(rigs, config):
+        found[first, second] = (
+            find_correspondence(rigs[first], rigs[second], config.pairs.markers)
+            if given is None
+            else load_correspondence(given, rigs[first], rigs[second])
+        )
+    return found
+
+
+def _load_correspondences(folder: Path, config: Config, rigs: dict[str, Rig]) -> dict[tuple[str, str], Correspondence]:
+    found = {}
+    for first, second in _registered(rigs, config):
+        path = folder / _pair_file(list(rigs), first, second)
+        if not path.is_file():
+            raise ReenactError(f"{path}: expected the pairs of places of the run, got no file; train again")
+        found[first, second] = load_correspondence(path, rigs[first], rigs[second])
+    return found
+
+
+def _registered(rigs: dict[str, Rig], config: Config) -> list[tuple[str, str]]:
+    """Keys of the pairs of rigs that have a correspondence; one that is given is always taken."""
+    if config.pairs.method != "geometry":
+        return []
+    small = [key for key, rig in rigs.items() if len(rig.neutral) <= MOST_VERTICES]
+    return list(itertools.combinations(rigs if config.pairs.correspondence is not None else small, 2))
+
+
+def _pair_file(keys: list[str], first: str, second: str) -> str:
+    return f"{keys.index(first)}-{keys.index(second)}.npz"
 
 
 def _load_rigs(folder: Path) -> dict[str, Rig]:
@@ -200,7 +275,7 @@ def _load_layouts(path: Path, config: Config, keys: list[str]) -> dict[str, Tens
     if not path.is_file():
         raise ReenactError(f"{path}: expected the layouts of the run, got no file; restore the folder or train again")
     layouts = load_tensors(path)
-    wanted = keys[1:] if config.layout.method == "found" else []
+    wanted = keys[1:] if config.layout.method != "none" else []
     if sorted(layouts) != sorted(wanted):
         raise ReenactError(
             f"{path}: expected layouts for {', '.join(wanted) or 'no rig'}, got {', '.join(layouts) or 'none'}; "

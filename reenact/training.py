@@ -1,10 +1,11 @@
 """train(): the one loop, for ReenactNet and for each rig's BPNet.
 
 Kim et al. 2021 (KI21), "Deep Learning-Based Unsupervised Human Facial Retargeting", doi:10.1111/cgf.14400,
-sections 3.2 and 3.3. Training goes through stages: ReenactNet first, then one BPNet per rig, so that each BPNet can
-learn from pictures as ReenactNet draws them. A stage renders some thousand expressions of each rig at a time, describes
-them once (`reenact.models`), and takes its batches from there until it renders others. Every random number comes from
-(seed, stage, step): a resumed run takes the same next step as an unbroken one.
+sections 3.2 and 3.3. The published training goes through stages: ReenactNet first, then one BPNet per rig. Ours is one
+stage in which both learn together: each BPNet reads what ReenactNet draws, and its errors tell ReenactNet what matters
+in a picture. A stage renders some thousand expressions of each rig at a time, describes them once (`reenact.models`),
+and takes its batches from there until it renders others. Every random number comes from (seed, stage, step): a resumed
+run takes the same next step as an unbroken one.
 """
 
 from __future__ import annotations
@@ -32,14 +33,16 @@ from reenact.data import Studio, jitter
 from reenact.errors import ReenactError
 from reenact.losses import VertexDistance, weight_distance
 from reenact.models import Networks
-from reenact.pairs import Pairs, find_pairs
+from reenact.pairs import Teacher
 from reenact.preview import save_preview
-from reenact.run import Run, restore_networks
+from reenact.run import MOST_VERTICES, Run, restore_networks
 
-_PICTURES_PER_COMPONENT = 8
+_PICTURES_PER_COMPONENT = 6
 """Pictures of each rig, per principal component, from which networks learn what varies before any training."""
 _CHUNK = 64
 """Expressions that are photographed at once; part of what makes a run repeatable."""
+_LEAST_TRUST = 0.2
+"""In what a teacher says of any expression: doubtful labels of all expressions beat sure ones of a few."""
 _LOG_EVERY = 20
 """Steps between lines of metrics.jsonl; each holds the mean since the last."""
 
@@ -49,7 +52,7 @@ class _Stage:
     """One network's share of the training."""
 
     name: str
-    """`reenactnet`, or `bpnet.KEY`."""
+    """`networks`; or `reenactnet`, then `bpnet.KEY`."""
     network: torch.nn.Module
     steps: int
     learning_rate: float
@@ -75,7 +78,7 @@ class _Partners:
     """What another rig makes of the expressions of a pool."""
 
     weights: Tensor  # (N, K)
-    described: Tensor | None  # (N, ...), where they are drawn
+    described: Tensor | None  # (N, ...), where they are pictured
     confidence: Tensor  # (N,)
 
 
@@ -86,7 +89,7 @@ class _Workshop:
     config: Config
     studios: dict[str, Studio]
     networks: Networks
-    pairs: dict[tuple[str, str], Pairs]
+    teachers: dict[tuple[str, str], Teacher]
     """By (source, target); empty where the settings ask for none."""
     vertex_distances: dict[str, VertexDistance]
 
@@ -121,9 +124,9 @@ def train(config: Config, resume: bool = False) -> Path:
             studios = {key: run.studio(key) for key in run.keys}
         networks = run.networks()
         with console.status("Comparing shapes"):
-            pairs = _find_pairs(run, studios, console)
+            teachers = _find_teachers(run, studios, console)
         distances = {key: VertexDistance(studio.rig, studio.typical) for key, studio in studios.items()}
-        stages = _stages(_Workshop(config, studios, networks, pairs, distances))
+        stages = _stages(_Workshop(config, studios, networks, teachers, distances))
         stage_index, first, optimizer = _restore(run, networks, stages) if resume else (0, 0, None)
         if (stage_index, first) == (0, 0):
             count = _PICTURES_PER_COMPONENT * config.reenactnet.components
@@ -190,48 +193,74 @@ def learning_rate(step: int, steps: int, peak: float, schedule: str) -> float:
     return peak * (1e-4 + (1 - 1e-4) * (1 + math.cos(math.pi * (step - warm) / (steps - warm))) / 2)
 
 
-def _find_pairs(run: Run, studios: dict[str, Studio], console: Console) -> dict[tuple[str, str], Pairs]:
-    """Pairs between all rigs, both ways; also written to pairs.json, for people to read."""
+def _find_teachers(run: Run, studios: dict[str, Studio], console: Console) -> dict[tuple[str, str], Teacher]:
+    """Teachers between all rigs, both ways; what they say of single shapes goes to pairs.json, for people to read."""
     if run.config.pairs.method == "none":
         return {}
-    pairs, words = {}, {}
+    teachers, words = {}, {}
+    if run.config.pairs.method == "geometry" and not run.correspondences:
+        console.print(
+            f"A rig has more than {MOST_VERTICES:,} vertices, too many to register: pictures alone tell which shapes "
+            "are one; give pairs of places with --pairs.correspondence for more",
+            soft_wrap=True,
+        )
     for source in studios:
         for target in studios:
             if source == target:
                 continue
-            found = pairs[source, target] = find_pairs(studios[source], studios[target], run.config.pairs)
+            teacher = run.teacher(studios[source], studios[target], source, target)
+            teachers[source, target] = teacher
             names = studios[source].rig.names, studios[target].rig.names
+            single = torch.eye(len(names[0]))
+            told = teacher.weights(single)
+            trust = teacher.confidence(single, told)
             words[f"{source} -> {target}"] = {
                 names[0][k]: {
-                    "agreed": any(k == pair[0] for pair in found.agreed),
-                    "similarity": round(float(found.similarity[k]), 3),
+                    "agreed": any(k == pair[0] for pair in teacher.agreed),
+                    "confidence": round(float(trust[k]), 3),
                     "shapes": {names[1][j]: round(value, 3) for j, value in enumerate(row) if value > 0.005},
                 }
-                for k, row in enumerate(found.matrix.tolist())
+                for k, row in enumerate(told.tolist())
             }
             console.print(
-                f"{source} -> {target}: {len(found.agreed)} of {len(names[0])} shapes look like one of the other "
-                "rig's, the rest like mixtures",
+                f"{source} -> {target}: {len(teacher.agreed)} of {len(names[0])} shapes are one of the other rig's, "
+                "the rest are mixtures",
                 soft_wrap=True,
             )
     write_atomically(run.folder / "pairs.json", (json.dumps(words, indent=1, ensure_ascii=False) + "\n").encode())
-    return pairs
+    return teachers
 
 
 def _stages(shop: _Workshop) -> list[_Stage]:
-    training, bpnet = shop.config.training, shop.config.bpnet
+    training, bpnet, keys = shop.config.training, shop.config.bpnet, list(shop.studios)
+
+    def render_all(seed: list[int]) -> dict[str, _Pool]:
+        return {key: _render(shop, key, seed, keys) for key in keys}
+
+    steps = _step_count(training.steps, training.epochs, training.frames, training.batch_size)
+    if training.together:
+        return [
+            _Stage(
+                "networks",
+                shop.networks,
+                steps,
+                training.learning_rate,
+                render_all,
+                lambda pools, random, done: _joint_losses(shop, pools, random, done),
+            )
+        ]
     stages = [
         _Stage(
             "reenactnet",
             shop.networks.reenactnet,
-            _step_count(training.steps, training.epochs, training.frames, training.batch_size),
+            steps,
             training.learning_rate,
-            lambda seed: {key: _render(shop, key, seed, list(shop.studios)) for key in shop.studios},
+            render_all,
             lambda pools, random, _done: _reenactnet_losses(shop, pools, random),
         )
     ]
-    for key in shop.studios:
-        others = [source for source, target in shop.pairs if target == key]
+    for key in keys:
+        others = [source for source, target in shop.teachers if target == key]
         stages.append(
             _Stage(
                 f"bpnet.{key}",
@@ -265,14 +294,62 @@ def _render(shop: _Workshop, key: str, seed: list[int], partners: list[str], pic
     seen = torch.cat(bent) if elastic else net.readable(described)
     found = {}
     for other in partners:
-        if (key, other) in shop.pairs:
-            pair, pictures = shop.pairs[key, other], []
-            theirs = pair.weights(weights)
+        if (key, other) in shop.teachers:
+            teacher, pictures = shop.teachers[key, other], []
+            theirs = teacher.weights(weights)
             for chunk in theirs.split(_CHUNK) if pictured else ():
                 pictures.append(net.describe(other, shop.studios[other].show(shop.studios[other].photograph(chunk))))
-            trust = pair.confidence(weights) + 1e-6  # rigs that have nothing in common still train
+            trust = teacher.confidence(weights, theirs).clamp_min(_LEAST_TRUST)
             found[other] = _Partners(theirs, torch.cat(pictures) if pictured else None, trust)
     return _Pool(weights, described, seen, found)
+
+
+def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Generator, done: float) -> dict[str, Tensor]:
+    """Each rig redraws itself and is read back, and the other where a teacher tells how. Ours, after KI21.
+
+    L_recon and L_b of KI21, with one more term: the weights that BPNet reads from what ReenactNet draws of the other
+    rig's pictures, whose error reaches both. Without a teacher BPNet reads what is drawn of the rig itself.
+    """
+    training, bpnet, networks, losses = shop.config.training, shop.config.bpnet, shop.networks, {}
+    net = networks.reenactnet
+
+    def add(name: str, value: Tensor) -> None:
+        losses[name] = losses.get(name, 0) + value
+
+    for key, pool in pools.items():
+        rows = torch.randint(len(pool.weights), (training.batch_size,), generator=random)
+        features, described = net.encode(pool.seen[rows], key), pool.described[rows]
+        drawn = net.decoders[key](features)
+        add(f"reconstruction.{key}", net.distances(key, drawn, described).mean())
+        predicted = networks.bpnets[key](net.readable(described))
+        add(f"weights.{key}", _weight_losses(shop, key, predicted, pool.weights[rows]).mean())
+        for other, partners in pool.partners.items():
+            theirs, trust = net.decoders[other](features), partners.confidence[rows]
+            trust = trust / trust.sum()
+            distances = net.distances(other, theirs, partners.described[rows])
+            add(f"pairs.{other}", training.pair_loss * (distances @ trust))
+            errors = _weight_losses(shop, other, networks.bpnets[other](net.readable(theirs)), partners.weights[rows])
+            add(f"read.{other}", training.read_loss * (errors @ trust))
+        if not pool.partners and training.read_loss:
+            read = networks.bpnets[key](net.readable(drawn))
+            add(f"read.{key}", training.read_loss * _weight_losses(shop, key, read, pool.weights[rows]).mean())
+        if bpnet.image_loss and done >= bpnet.image_from:
+            some = slice(max(1, round(bpnet.image_fraction * training.batch_size)))
+            add(f"image.{key}", bpnet.image_loss * _image_loss(shop, key, predicted[some], described[some]))
+    return losses
+
+
+def _weight_losses(shop: _Workshop, key: str, predicted: Tensor, weights: Tensor) -> Tensor:
+    """(N,), how wrong predicted weights are: L_w of KI21, and by how far they move the vertices (ours)."""
+    bpnet, moved = shop.config.bpnet, shop.vertex_distances[key](predicted, weights)
+    return bpnet.weight_loss * weight_distance(predicted, weights) + bpnet.vertex_loss * moved
+
+
+def _image_loss(shop: _Workshop, key: str, predicted: Tensor, described: Tensor) -> Tensor:
+    """L_r of KI21: how far the render of predicted weights is from the picture that they were read from."""
+    again = shop.studios[key].show(shop.studios[key].photograph(predicted))
+    net = shop.networks.reenactnet
+    return net.distances(key, net.describe(key, again), described).mean()
 
 
 def _reenactnet_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Generator) -> dict[str, Tensor]:
@@ -322,15 +399,13 @@ def _bpnet_losses(
     predicted = shop.networks.bpnets[key](read)
     losses = {}
     if bpnet.weight_loss:
-        losses["weights"] = bpnet.weight_loss * weight_distance(predicted, weights)
+        losses["weights"] = bpnet.weight_loss * weight_distance(predicted, weights).mean()
     if bpnet.vertex_loss:
-        losses["vertices"] = bpnet.vertex_loss * shop.vertex_distances[key](predicted, weights)
+        losses["vertices"] = bpnet.vertex_loss * shop.vertex_distances[key](predicted, weights).mean()
     others = 0 if sources == [key] else count  # the first pictures are then of expressions that were not rendered
     rendered = min(max(1, round(bpnet.image_fraction * bpnet.batch_size)), bpnet.batch_size - others)
     if bpnet.image_loss and done >= bpnet.image_from and rendered:
-        again = shop.studios[key].show(shop.studios[key].photograph(predicted[-rendered:]))
-        distance = net.distances(key, net.describe(key, again), described[-rendered:]).mean()
-        losses["image"] = bpnet.image_loss * distance
+        losses["image"] = bpnet.image_loss * _image_loss(shop, key, predicted[-rendered:], described[-rendered:])
     return losses
 
 
@@ -343,9 +418,9 @@ def _step_count(steps: int, epochs: float | None, frames: int, batch_size: int) 
 
 def _optimizer(config: Config, stage: _Stage) -> torch.optim.Optimizer:
     if config.training.optimizer == "adam":
-        return torch.optim.Adam(stage.network.parameters(), lr=stage.learning_rate)
-    return torch.optim.AdamW(
-        stage.network.parameters(), lr=stage.learning_rate, weight_decay=config.training.weight_decay
+        return torch.optim.Adam(stage.network.parameters(), lr=stage.learning_rate, fused=True)
+    return torch.optim.AdamW(  # fused: a quarter of each step's time otherwise
+        stage.network.parameters(), lr=stage.learning_rate, weight_decay=config.training.weight_decay, fused=True
     )
 
 
@@ -420,7 +495,8 @@ def _preview(
 ) -> None:
     """A failing preview never stops training."""
     try:
-        trained = [key for index, key in enumerate(studios) if index + 1 <= stage]
+        together = run.config.training.together
+        trained = [key for index, key in enumerate(studios) if together or index + 1 <= stage]
         networks.eval()
         save_preview(run.folder / "previews" / f"{total:06d}.png", studios, networks, trained)
     except Exception as error:

@@ -61,12 +61,22 @@ def test_help_names_every_command(capsys):
             "train",
             ["--config FILE.toml", "--resume", "--run", "--source", "--target", "--source-clip", "--target-clip"],
         ),
-        ("train", ["--training.steps INT", "Optimizer steps of ReenactNet.", "--images.no-residual", "{found,none}"]),
+        (
+            "train",
+            [
+                "--training.steps INT",
+                "Optimizer steps; of ReenactNet alone",
+                "--images.no-residual",
+                "{found,pictures,none}",
+            ],
+        ),
         (
             "infer",
             ["RUN", "CLIP", "--out FILE", "--reverse", "--fps", "--post.gain", "Live Link Face"],
         ),
         ("evaluate", ["[RUN ...]", "--frames INT", "--seed INT", "--suite", "--methods NAME"]),
+        ("view", ["RUN|RIG", "--clip CLIP", "--method NAME", "--audio FILE.wav", "--nudges FILE.json", "--no-browser"]),
+        ("render", ["[RUN] CLIP", "--out OUT", "--rig RIG", "--size INT", "--fps", "--opengl", "side by side"]),
         ("convert", ["IN", "OUT", "--rig RIG", "--parts NAME", "--fps", "--post.smooth FLOAT"]),
         ("inspect", ["--out FILE.png", "--json FILE.json", "--parts NAME", "looks wrong"]),
         ("rigs", ["--out FILE.png", "--size INT"]),
@@ -445,9 +455,9 @@ def test_the_suite_prints_a_table_of_methods(capsys, monkeypatch, tmp_path):
 
     monkeypatch.setattr(suite, "TARGETS", ("anny:woman",))
     monkeypatch.setattr(suite, "find_correspondence", lambda *_: None)
-    out = tmp_path / "rows.json"
+    out = tmp_path / "rows.jsonl"
     arguments = ["evaluate", "--suite", "geometric", "--methods", "copy", "neutral", "rbf", "--frames", "36"]
-    assert main([*arguments, "--seeds", "2", "--json", f"{out}"]) == 0
+    assert main([*arguments, "--seeds", "2", "--results", f"{out}"]) == 0
     text = capsys.readouterr().out
     assert "| copy | 0.000 ± 0.000 |" in text  # the same names and the same ranges
     assert "| neutral | 1.000 ± 0.000 |" in text

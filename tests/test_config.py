@@ -10,7 +10,7 @@ from reenact.atomic import write_atomically
 from reenact.config import (
     Config,
     ImageConfig,
-    changed_keys,
+    changed_settings,
     check_config,
     config_from_dict,
     config_to_dict,
@@ -123,9 +123,12 @@ def test_whole_numbers_may_stand_for_fractions(tmp_path):
         ("[bpnet]\ndecoded_fraction = 1.5", "bpnet.decoded_fraction: expected a number from 0 to 1, got 1.5"),
         ("[bpnet]\nchannels = 12", "bpnet.channels: expected a multiple of 8, got 12"),
         ("[reenactnet]\nkernel = 4", "reenactnet.kernel: expected an odd number from 3 to 15, got 4"),
-        ("[training]\nepochs = 3", "training.epochs: expected training.refresh = 0 beside it, got 2000"),
-        ("[bpnet]\nepochs = 3", "bpnet.epochs: expected training.refresh = 0 beside it, got 2000"),
-        ("[images]\nmotion = false", 'pairs.method: expected images.motion beside "found", got none'),
+        ("[training]\nepochs = 3", "training.epochs: expected training.refresh = 0 beside it, got 2500"),
+        ("[bpnet]\nepochs = 3", "bpnet.epochs: expected training.refresh = 0 beside it, got 2500"),
+        (
+            '[images]\nmotion = false\n[pairs]\nmethod = "pictures"',
+            'pairs.method: expected images.motion beside "pictures", got none',
+        ),
         ("[images]\nresidual = false", "images.motion: expected images.residual beside it, got none"),
         ("[training]\nframes = 7", "training.frames: expected a whole number from 8 to 1,000,000, got 7"),
         ("[bpnet]\nweight_loss = 0\nimage_loss = 0\nvertex_loss = 0", "bpnet: expected a loss above 0"),
@@ -157,9 +160,9 @@ def test_a_missing_file_is_named(tmp_path):
         load_config(tmp_path / "none.toml")
 
 
-def test_changed_keys_are_named_with_their_section():
+def test_changed_settings_are_named_with_their_section():
     new = replace(Config(), run="r", training=replace(Config().training, steps=1))
-    assert changed_keys(Config(), new) == ["run", "training.steps"]
+    assert list(changed_settings(Config(), new)) == ["run", "training.steps"]
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])

@@ -241,6 +241,7 @@ def test_the_verdict_does_not_flatter():
 
 def test_the_verdict_says_when_pairs_alone_do_better():
     assert "pairs" not in report.verdict(make_result())
+    assert "labels" not in report.verdict(make_result())
     assert "copying by look is better" in report.verdict(make_result(paired=0.0))
     assert "reach 0.50 without any network. " in report.verdict(make_result(paired=0.5))
 

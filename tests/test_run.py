@@ -129,7 +129,8 @@ def test_an_empty_folder_is_taken_over_even_through_a_link(linked, quick, tmp_pa
 def test_the_folder_that_the_user_stands_in_is_taken_over(quick, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = Run.create(replace(quick, run="."))
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["config.toml", "layouts.safetensors", "rigs"]
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["config.toml", "correspondences", "layouts.safetensors", "rigs"]
     assert Run.open(run.folder).keys == ["ball", "egg"]
 
 

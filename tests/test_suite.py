@@ -1,5 +1,7 @@
 """The table of methods: what it measures is what it says."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -9,7 +11,7 @@ from reenact.evaluation import common_shapes, true_weights, vertex_error_ratio
 from reenact.retargeting.correspondence import Correspondence
 from reenact.rigs import anny
 from reenact.rigs.files import load_rig
-from reenact.suite import Row, region_vertices, run_suite, table
+from reenact.suite import Cell, append_cell, load_cells, region_vertices, run_suite, table, versions
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +70,10 @@ def test_regional_errors_are_the_error_over_those_vertices(man):
 
 def test_a_table_has_means_and_spreads_and_dashes():
     rows = [
-        Row("a", "anny:b", "x", seed, 0.0, {"ver": value, "lips": {"f1": 1.0}}) for seed, value in enumerate((0.1, 0.3))
+        Cell("a", "anny:b", "x", seed, 0.0, {"ver": value, "lips": {"f1": 1.0}})
+        for seed, value in enumerate((0.1, 0.3))
     ]
-    rows.append(Row("a", "anny:b", "y", 0, 0.0, {}, "no"))
+    rows.append(Cell("a", "anny:b", "y", 0, 0.0, {}, "no"))
     assert table(rows).splitlines() == [
         "| ver | a to b |",
         "|---|---|",
@@ -78,3 +81,50 @@ def test_a_table_has_means_and_spreads_and_dashes():
         "| y | - |",
     ]
     assert "| x | 1.000 ± 0.000 |" in table(rows, "lips.f1")
+
+
+def test_finished_cells_are_kept_and_not_made_again(tmp_path, monkeypatch):
+    pairs = Correspondence.identity(load_rig("anny:man"), load_rig("anny:woman"))
+    monkeypatch.setattr(suite, "find_correspondence", lambda *_: pairs[torch.arange(0, len(pairs), 40)])
+    file, asked = tmp_path / "results" / "cells.jsonl", [("anny:man", "anny:woman")]
+    first = run_suite(asked, ("copy",), frames=36, seeds=(0,), results=file)
+    monkeypatch.setattr(suite, "measure", lambda *_: {"ver": 9.0})
+    both = run_suite(asked, ("copy",), frames=36, seeds=(0, 1), results=file)
+    assert [cell.numbers["ver"] for cell in both] == [0.0, 9.0]
+    assert both[0] == first[0]
+    assert len(file.read_text().splitlines()) == 2
+    assert "one code version" in versions(both)
+    other = replace(both[1], code="abc")
+    append_cell(file, other)
+    assert load_cells(file)[1] == other  # the last of equal keys
+    assert "2 code versions" in versions([both[0], other])
+    file.write_text("{}\n")
+    with pytest.raises(ReenactError, match="line 1: expected a cell"):
+        load_cells(file)
+
+
+def test_copied_weights_are_perfect_there_and_back_and_shape_by_shape(monkeypatch):
+    pairs = Correspondence.identity(load_rig("anny:man"), load_rig("anny:woman"))
+    monkeypatch.setattr(suite, "find_correspondence", lambda *_: pairs[torch.arange(0, len(pairs), 40)])
+    copied, still = run_suite([("anny:man", "anny:woman")], ("copy", "neutral"), frames=36)
+    assert copied.numbers["single"]["right"] == 1
+    assert copied.numbers["single"]["elsewhere"] < 0.35  # gaze moves both eyes, so each has half of the energy
+    assert (copied.numbers["cyclic"]["mae"], copied.numbers["cyclic"]["skill"]) == (0, 1)
+    assert (still.numbers["cyclic"]["skill"], still.numbers["ver"]) == (0, 1)
+    assert still.numbers["cyclic"]["ssim"] < 1
+
+
+def test_a_configuration_of_networks_is_a_cell_and_a_stopped_run_goes_on(toy_config, tmp_path):
+    quick = replace(toy_config, training=replace(toy_config.training, steps=4, refresh=0))
+    asked = [(quick.source, quick.target)]
+    file, runs = tmp_path / "cells.jsonl", tmp_path / "runs"
+    (cell,) = run_suite(asked, (), frames=36, configs={"quick": quick}, results=file, runs=runs)
+    assert (cell.source, cell.target, cell.method) == ("ball", "egg", "quick")
+    assert cell.settings["training.steps"] == 4
+    assert "source" not in cell.settings
+    assert {"ver", "cyclic", "own", "taught", "speed", "kinds", "single"} <= cell.numbers.keys()
+    file.unlink()
+    (again,) = run_suite(asked, (), frames=36, configs={"quick": quick}, results=file, runs=runs)
+    assert again.numbers["ver"] == cell.numbers["ver"]
+    assert again.seconds < cell.seconds  # trained before
+    assert load_cells(file) == [again]

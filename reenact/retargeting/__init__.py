@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 
 from reenact.retargeting.anacondar import Anacondar
+from reenact.retargeting.consensus import Consensus
 from reenact.retargeting.cross_mapping import CrossMapping, KernelCCA
 from reenact.retargeting.deformation_transfer import DeformationTransfer
 from reenact.retargeting.delta_transfer import DeltaTransfer
@@ -37,6 +38,7 @@ METHODS: dict[str, Callable[..., Retargeter]] = {
     "quantile": partial(ManifoldAlignment, preset="quantile"),
     "residual": partial(ManifoldAlignment, preset="residual"),
     "shape-matching": ShapeMatching,
+    "consensus": Consensus,
 }
 """What makes a retargeter, called with source, target, correspondence and optional training clip."""
 

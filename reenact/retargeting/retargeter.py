@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -12,6 +12,7 @@ from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
 
+@runtime_checkable
 class Retargeter(Protocol):
     """Moves motion from `source` to `target`; everything slow happened in the constructor."""
 
