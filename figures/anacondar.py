@@ -3,7 +3,7 @@
     python figures/anacondar.py [--target anny:toon] [--out docs/images]
 
 anacondar-patches.png      80 patches of the source, and the same ones on the target
-anacondar-components.png   frames of a clip: source, parts of the method, result, truth, with the distance from the truth
+anacondar-components.png   frames of a clip: source, parts of the method, result, truth, with the distance from truth
 anacondar-gravity.png      one expression without weight, upright, and hanging head down
 anacondar-stiffness.png    the same under gravity with soft, usual and stiff cheeks
 """

@@ -58,8 +58,8 @@ _TISSUE = (
     (1.1, 0.4, 0.130), (1.7, 0.2, 0.130), (0.0, 0.0, 0.080), (0.6, 0.0, 0.090), (0.0, -0.8, 0.080), (1.3, -0.6, 0.100),
     (0.0, -1.7, 0.120),
 )  # fmt: skip
-"""Thickness at places of an average face: forehead, temple, bridge of the nose, lid, tip of the nose, cheek, lips, chin,
-edge of the jaw, neck. A face of 0.125 m has 5 mm on the forehead and 16 mm in the cheek."""
+"""Thickness at places of an average face: forehead, temple, bridge of the nose, lid, tip of the nose, cheek, lips,
+chin, edge of the jaw, neck. A face of 0.125 m has 5 mm on the forehead and 16 mm in the cheek."""
 _PLAIN_TISSUE = 0.06
 """Thickness, share of H, where no mouth or eyes are found that say which place is which."""
 
@@ -379,8 +379,8 @@ class Shell:
         volumes = tet_volumes(self.nodes.numpy(), self.tets)
         if not (volumes > 0).all():
             raise ReenactError(
-                f"{self.rig.name}: expected tissue of positive volume, got {int((volumes <= 0).sum())} of {len(volumes)} "
-                "tetrahedra without; make it thinner there"
+                f"{self.rig.name}: expected tissue of positive volume, got {int((volumes <= 0).sum())} of "
+                f"{len(volumes)} tetrahedra without; make it thinner there"
             )
 
     def __len__(self) -> int:
@@ -427,7 +427,7 @@ class Shell:
         return self.nodes[: len(self)] + torch.from_numpy(np.stack([self.sampler @ offset for offset in offsets]))
 
     def jaw_pose(self, vertices: Float[Tensor, "T V 3"]) -> tuple[Float[Tensor, "T 3 3"], Float[Tensor, "T 3"]]:
-        """Rotation and translation of the jaw from rest, by the lower teeth or else the chin; the head is held still."""
+        """Rotation and translation of the jaw from rest, by lower teeth or else the chin; the head is held still."""
         self._check(vertices)
         marks = self.landmarks
         rest = self.rig.neutral.double().numpy()[marks.jaw_vertices]
@@ -438,7 +438,7 @@ class Shell:
         return tuple(torch.from_numpy(np.stack(part)) for part in zip(*poses))
 
     def head_pose(self, vertices: Float[Tensor, "T V 3"]) -> tuple[Float[Tensor, "T 3 3"], Float[Tensor, "T 3"]]:
-        """Rotation and translation of the head from rest, by the vertices that no shape moves; none where there are none.
+        """Rotation and translation of the head from rest, by vertices that no shape moves; none where there are none.
 
         A pose under a millionth of H is none: a still head stays exactly still.
         """
@@ -456,7 +456,7 @@ class Shell:
         return rotations, translations
 
     def bones(self, vertices: Float[Tensor, "T V 3"]) -> Float[Tensor, "T X 3"]:
-        """Where nodes are that bone or the border hold; the others at rest, carried along with the jaw by their share."""
+        """Where nodes are that bone or the border hold; the others at rest, carried with the jaw by their share."""
         rotation, translation = self.jaw_pose(vertices)
         jaw = torch.einsum("tij,xj->txi", rotation, self.nodes) + translation[:, None]
         share = np.where(self.bone == JAW, 1.0, np.where(self.bone == SKULL, 0.0, self._column(self.jaw_share)))
@@ -822,7 +822,7 @@ def _layers(
 def _untangled(
     nodes: Float[ndarray, "X 3"], tets: ndarray, least: Float[ndarray, "M"], skin: int, height: float
 ) -> Float[ndarray, "X 3"]:
-    """Nodes moved until every tetrahedron has its least volume, or at least a positive one; skin as little as can be."""
+    """Nodes moved until every tetrahedron has its least volume, or a positive one; skin as little as can be."""
     nodes = np.array(nodes)
     for share, floor, mobility_of_skin in ((1.0, 1e-9, 0.1), (0.1, 1e-9, 0.3), (0.0, 1e-10, 1.0), (0.0, 1e-12, 1.0)):
         goal = (share * least).clip(min=floor * height**3)
@@ -995,7 +995,7 @@ class Rest:
 
 
 def _harmonic(rig: Rig, unknown: ndarray, numbers: ndarray, place: ndarray) -> coo_array:
-    """(V, N) sparse: what the vertices connected to the skin take of its border; it fades within a tenth of the head."""
+    """(V, N) sparse: what vertices connected to the skin take of its border; it fades within a tenth of the head."""
     count = len(rig.neutral)
     laplacian = cotangent_laplacian(rig.neutral.double(), rig.faces, low=1e-3)
     size = np.ptp(rig.neutral.double().numpy()[:, 1])
@@ -1022,8 +1022,8 @@ def interpenetration(shell: Shell, vertices: Float[Tensor, "T V 3"]) -> dict[str
     """How deep the two sides of each contact lie in each other, metres; 0 where they do not.
 
     A vertex of one side is inside the other where the closest point of that side's skin faces away from it, within 60
-    degrees of straight, and is no border of it. Its depth is the distance to that point. Where sides already lie in each other at rest, as lips do in
-    some sculpted neutrals, that depth counts too.
+    degrees of straight, and is no border of it. Its depth is the distance to that point. Where
+    sides already lie in each other at rest, as lips do in some sculpted neutrals, that depth counts too.
     """
     shell._check(vertices)
     depths = {}

@@ -1,9 +1,9 @@
 """Faces at rest under elasticity, volume, muscles, contact and force: a quasi-static solve for every frame.
 
 AnaConDaR, "Anatomically Constrained Data-Adaptive Facial Retargeting", 2024, ends in "a quasi-static physics-based
-simulation", which "enables artistic interventions on material properties, can incorporate external forces, and preserves
-expression-specific characteristics"; the text that we have does not tell its energies. These are our reconstruction, in
-the form of Bouaziz et al. 2014, "Projective Dynamics: Fusing Constraint Projections for Fast Simulation",
+simulation", which "enables artistic interventions on material properties, can incorporate external forces, and
+preserves expression-specific characteristics"; the text that we have does not tell its energies. These are our
+reconstruction, in the form of Bouaziz et al. 2014, "Projective Dynamics: Fusing Constraint Projections for Fast Simulation",
 doi:10.1145/2601097.2601116: each term draws to a projection of where the nodes are, and the sum is solved with one
 matrix that never changes.
 
@@ -32,7 +32,15 @@ from scipy.sparse import coo_array, diags_array
 from torch import Tensor
 
 from reenact.errors import ReenactError
-from reenact.retargeting.anatomy import Shell, Side, _compiled, factored, nearest_rotations, stiffness_matrix, turn_towards
+from reenact.retargeting.anatomy import (
+    Shell,
+    Side,
+    _compiled,
+    factored,
+    nearest_rotations,
+    stiffness_matrix,
+    turn_towards,
+)
 
 _GRAVITY = 0.125
 """Half of density x gravity x height of the face / shear modulus: 1,000 kg/m^3, 9.8 m/s^2, 0.125 m, 5 kPa."""
@@ -278,9 +286,7 @@ class FacePhysics:
                 active = np.abs(pushed[self._touching]).max(1) > 0
                 clock("contact")
             sides = np.zeros_like(state)
-            _project(
-                state, shell.tets, vectors, self._weights, config.band, turns, muscle_turns, stretches, sides
-            )
+            _project(state, shell.tets, vectors, self._weights, config.band, turns, muscle_turns, stretches, sides)
             if config.contact > 0:
                 points = np.where(active[:, None], goals, state[self._touching])
                 sides[self._touching] += self._contact[:, None] * points
@@ -459,9 +465,7 @@ def _project(points, tets, vectors, weights, band, turns, muscle_turns, stretche
         if weights[e, 2] > 0:
             for i in range(3):
                 for j in range(3):
-                    g[i, j] = (
-                        f[i, 0] * stretches[e, 0, j] + f[i, 1] * stretches[e, 1, j] + f[i, 2] * stretches[e, 2, j]
-                    )
+                    g[i, j] = f[i, 0] * stretches[e, 0, j] + f[i, 1] * stretches[e, 1, j] + f[i, 2] * stretches[e, 2, j]
                     r[i, j] = muscle_turns[e, i, j]
             for _ in range(2):
                 if turn_towards(g, r) < 1e-5:
@@ -475,6 +479,4 @@ def _project(points, tets, vectors, weights, band, turns, muscle_turns, stretche
         for c in range(4):
             node = tets[e, c]
             for i in range(3):
-                sides[node, i] += (
-                    p[i, 0] * vectors[e, c, 0] + p[i, 1] * vectors[e, c, 1] + p[i, 2] * vectors[e, c, 2]
-                )
+                sides[node, i] += p[i, 0] * vectors[e, c, 0] + p[i, 1] * vectors[e, c, 1] + p[i, 2] * vectors[e, c, 2]
