@@ -2,8 +2,8 @@
 
 AnaConDaR, "Anatomically Constrained Data-Adaptive Facial Retargeting", 2024, describes "a fully volumetric deformation
 transfer for faces, which respects anatomical and physical constraints"; the text that we have ends before its
-equations. These are our reconstruction, after Sumner & Popović 2004 with tetrahedra in place of triangles, which need no
-stand-in for the direction along the normal.
+equations. These are our reconstruction, after Sumner & Popović 2004 with tetrahedra in place of triangles, which need
+no stand-in for the direction along the normal.
 
 Symbol  Code                  Shape
 F^S_e   source gradients      (T, M, 3, 3) what the source's tissue did

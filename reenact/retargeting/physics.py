@@ -3,9 +3,9 @@
 AnaConDaR, "Anatomically Constrained Data-Adaptive Facial Retargeting", 2024, ends in "a quasi-static physics-based
 simulation", which "enables artistic interventions on material properties, can incorporate external forces, and
 preserves expression-specific characteristics"; the text that we have does not tell its energies. These are our
-reconstruction, in the form of Bouaziz et al. 2014, "Projective Dynamics: Fusing Constraint Projections for Fast Simulation",
-doi:10.1145/2601097.2601116: each term draws to a projection of where the nodes are, and the sum is solved with one
-matrix that never changes.
+reconstruction, in the form of Bouaziz et al. 2014, "Projective Dynamics: Fusing Constraint Projections for Fast
+Simulation", doi:10.1145/2601097.2601116: each term draws to a projection of where the nodes are, and the
+sum is solved with one matrix that never changes.
 
     min_X  sum_e elasticity vol_e |F_e - Q_e|^2                  Q_e the rotation closest to F_e
          + sum_e volume vol_e |F_e - P_e|^2                      P_e the closest with a determinant in 1 +- band
