@@ -494,7 +494,7 @@ def test_fifty_shapes_are_personalised_within_a_second_and_a_frame_takes_millise
         assert min(_seconds(lambda preset=preset: personalise(shapes, shapes, training, preset=preset))) < 1
         solver = frame_solver(shapes, preset)
         # A tenth of a millisecond without the type checks of the tests; machines that run them have other work.
-        assert min(_seconds(lambda solver=solver: [solver.step(frame) for frame in training[:100]])) < 0.3
+        assert min(_seconds(lambda solver=solver: [solver.step(frame) for frame in training[:100]])) < 0.6
 
 
 def _seconds(work) -> list[float]:
