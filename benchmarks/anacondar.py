@@ -31,7 +31,8 @@ from reenact.evaluation import held_out_clips, moving_vertices, true_weights
 from reenact.geometry import rigid_fit
 from reenact.retargeting.anacondar import Anacondar, AnacondarConfig
 from reenact.retargeting.anatomical_transfer import AnatomicalTransfer
-from reenact.retargeting.anatomy import JAW, build_shell, interpenetration
+from reenact.retargeting.anatomy import JAW, build_shell
+from reenact.retargeting.contact import interpenetration
 from reenact.retargeting.correspondence import find_correspondence
 from reenact.retargeting.deformation_transfer import DeformationTransfer, densify
 from reenact.retargeting.examples import choose

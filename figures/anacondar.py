@@ -124,16 +124,16 @@ def draw_components(method: Anacondar, transfer: DeformationTransfer, plain: Pat
 
 
 def draw_forces(source: Rig, target: Rig, settings: dict, folder: Path) -> None:
-    """Targets hold the weight of a face already, so that gravity here is drawn in multiples of it."""
+    """Soft tissue whose skin holds on little, in a centrifuge: a cheek that holds on to its bone sags little at 1 g."""
     frame = source.vertices(weights(source))[:1]
-    config = AnacondarConfig(physics=PhysicsConfig(skin=10.0))  # skin that holds on less, so that tissue may sag
+    config = AnacondarConfig(physics=PhysicsConfig(skin=1.0, elasticity=0.3, muscle=0.3))
     method = Anacondar(source, target, config=config, **settings)
     rest = method.stages(frame).vertices[0]
     row, heats = [(picture(target, rest), "no weight")], [(np.ones((SIZE, SIZE, 3)), "")]
     for title, force in (
-        ("5 g down", (0.0, -5.0, 0.0)),
-        ("5 g up: head down", (0.0, 5.0, 0.0)),
-        ("5 g sideways", (5.0, 0.0, 0.0)),
+        ("20 g down", (0.0, -20.0, 0.0)),
+        ("20 g up: head down", (0.0, 20.0, 0.0)),
+        ("20 g sideways", (20.0, 0.0, 0.0)),
     ):
         moved = method.stages(frame, force=torch.tensor(force)).vertices[0]
         fall = (moved - rest).norm(dim=-1)
@@ -150,9 +150,9 @@ def draw_forces(source: Rig, target: Rig, settings: dict, folder: Path) -> None:
             source, target, config=config, stiffness=1 + (factor - 1) * cheeks, shell=method.shell, **settings
         )
         still = edited.stages(frame).vertices[0]
-        moved = edited.stages(frame, force=torch.tensor([0.0, -5.0, 0.0])).vertices[0]
+        moved = edited.stages(frame, force=torch.tensor([0.0, -20.0, 0.0])).vertices[0]
         fall = (moved - still).norm(dim=-1)
-        row.append((picture(target, moved), f"{title}, 5 g down"))
+        row.append((picture(target, moved), f"{title}, 20 g"))
         mean = 1000 * float((fall * cheeks).sum() / cheeks.sum())
         heats.append((picture(target, moved, heat(target, fall, 0.008)), f"cheeks fall by {mean:.2f} mm"))
     row.append((picture(target, target.neutral, heat(target, 0.006 * cheeks, 0.006)), "what was edited"))

@@ -10,7 +10,8 @@ from reenact.errors import ReenactError
 from reenact.evaluation import held_out_clips, moving_vertices
 from reenact.retargeting import METHODS
 from reenact.retargeting.anacondar import Anacondar, AnacondarConfig
-from reenact.retargeting.anatomy import build_shell, default_thickness, interpenetration
+from reenact.retargeting.anatomy import build_shell, default_thickness
+from reenact.retargeting.contact import interpenetration
 from reenact.retargeting.correspondence import Correspondence, find_correspondence
 from reenact.retargeting.deformation_transfer import DeformationTransfer
 from reenact.retargeting.examples import choose

@@ -25,11 +25,12 @@ from torch import Tensor
 
 from reenact.errors import ReenactError
 from reenact.geometry import rigid_fit, similarity_fit
-from reenact.retargeting.anatomy import JAW, Shell, build_shell, carry_shell, factored, scatter, stiffness_matrix
+from reenact.retargeting.anatomy import JAW, Shell, build_shell, carry_shell
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import DeformationTransfer, densify
 from reenact.retargeting.inverse_rig import InverseRig
 from reenact.retargeting.retargeter import check_names
+from reenact.retargeting.tetrahedra import factored, scatter, stiffness_matrix
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 

@@ -18,25 +18,20 @@ Eyes, teeth, tongue, lashes and the lining of the mouth stay outside: see `Rest`
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.sparse import coo_array, csr_array, diags_array, eye_array
-from scipy.sparse.csgraph import dijkstra
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import SuperLU
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reenact.errors import ReenactError
 from reenact.geometry import (
-    closest_points,
     closest_points_around,
     cotangent_laplacian,
     farthest_points,
@@ -45,8 +40,27 @@ from reenact.geometry import (
 )
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import connected_pieces, vertex_pairs
+from reenact.retargeting.landmarks import (
+    Contact,
+    Landmarks,
+    along_surface,
+    mesh_edges,
+    rigid_pose,
+    smoothed,
+    smoothing_matrix,
+)
 from reenact.retargeting.rbf import ThinPlate
 from reenact.retargeting.registration import Face
+from reenact.retargeting.tetrahedra import (
+    factored,
+    first_hits,
+    hat_gradients,
+    nearest_rotations,
+    scatter,
+    stiffness_matrix,
+    tet_volumes,
+    untangle,
+)
 from reenact.rigs.head import boundary_edges
 from reenact.rigs.rig import Rig
 
@@ -80,260 +94,6 @@ class ShellConfig:
     """Skin that expressions move over the bone by more than this many thicknesses is not grown to it."""
     opening: float = 0.1
     """Distance from lips and lids, share of H, within which there is no bone."""
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# What a rig tells of its anatomy
-
-
-@dataclass(frozen=True)
-class Contact:
-    """Two sides of skin that touch but do not pass through each other, as vertices of the rig."""
-
-    upper: Int[Tensor, "U"]
-    lower: Int[Tensor, "L"]
-    pairs: Int[Tensor, "P 2"]
-    """Upper and lower vertices that meet when it shuts, from the right of the character to its left."""
-
-
-def face_height(rig: Rig) -> float:
-    """H: root of the nose to chin, metres; 1.8 times the height of the lids above the lips where both are found.
-
-    Otherwise the height of what moves. Source: the proportion of an average adult, as in `evaluation`.
-    """
-    return Landmarks.of(rig).height
-
-
-@dataclass(frozen=True)
-class Landmarks:
-    """What shapes tell of a face without names: its jaw, lips and lids."""
-
-    face: Face
-    height: float
-    jaw_shape: int
-    """The shape that opens the jaw: the one that moves most skin downwards."""
-    jaw_motion: tuple[Float[ndarray, "3 3"], Float[ndarray, "3"]]
-    """Rotation and translation of the jaw in that shape at full strength."""
-    jaw_share: Float[ndarray, "N"]
-    """How far each vertex of the face follows the jaw, 0 to 1."""
-    jaw_vertices: Int[ndarray, "J"]
-    """Vertices of the rig that tell where the jaw is: lower teeth, or skin of the chin where there are none."""
-    jaw_weights: Float[ndarray, "J"]
-    condyles: Float[ndarray, "2 3"] | None
-    """Joints of the jaw, where only skin tells its pose; None where teeth do."""
-    jaw_pieces: Int[ndarray, "C"]
-    """Vertices of loose pieces that move with the jaw as one: lower teeth."""
-    skull_pieces: Int[ndarray, "D"]
-    """Vertices of loose pieces that no shape moves: upper teeth."""
-    contacts: dict[str, Contact]
-    """`lips`, `lids_left`, `lids_right`, those that are found."""
-    mouth: Float[ndarray, "3"] | None
-    eyes: Float[ndarray, "2 3"] | None
-    """Middle of the lids, left and right of the character."""
-
-    @classmethod
-    def of(cls, rig: Rig) -> Landmarks:
-        """
-        Raises:
-            ReenactError: The shapes move no face, see `registration.Face`.
-        """
-        face = Face.of(rig)
-        points, height = face.points, face.height
-        jaw_shape = int((face.areas[None] * -face.deltas[:, :, 1].clip(max=0)).sum(1).argmax())
-        opening = face.deltas[jaw_shape]
-        travel = np.linalg.norm(opening, axis=1)
-        # Chin: moves far when the jaw opens, and little otherwise.
-        others = np.square(np.delete(face.deltas, jaw_shape, 0)).sum((0, 2))
-        telling = np.square(travel**2 / (travel**2 + 0.5 * others + 1e-12 * height**2)) * face.areas
-        chin = np.flatnonzero(
-            (travel > 0.7 * travel.max()) & (telling > 0.2 * telling[travel > 0.7 * travel.max()].max())
-        )
-        middle = np.array([np.median(points[face.strength > 0.1, 0]), *points[chin].mean(0)[1:]])
-        condyles = middle + np.array([[0.4, 0.32, -0.45], [-0.4, 0.32, -0.45]]) * height
-        jaw_vertices, jaw_weights = face.vertices[chin], telling[chin] / telling[chin].sum()
-        motion = _pose(points[chin], points[chin] + opening[chin], jaw_weights, condyles)
-
-        jaw_pieces, skull_pieces = _loose_pieces(rig, face, jaw_shape, motion)
-        if len(jaw_pieces) >= 12:
-            teeth = rig.neutral[jaw_pieces].double().numpy()
-            jaw_vertices, condyles = jaw_pieces, None
-            jaw_weights = np.full(len(jaw_pieces), 1 / len(jaw_pieces))
-            motion = _pose(teeth, teeth + rig.deltas[jaw_shape, jaw_pieces].double().numpy(), jaw_weights, None)
-        rigid = points @ motion[0].T + motion[1] - points
-        length = np.square(rigid).sum(1)
-        share = (opening * rigid).sum(1) / np.maximum(length, (0.02 * height) ** 2)
-        share = _repeated(_smoother(face.faces, len(points)), share.clip(0, 1), 2)
-
-        lips = _lips(face, share, height)
-        lids = _lids(face, lips, height)
-        if lips is not None and len(lids) == 2:
-            sides = [points[pair.ravel()].mean(0) for pair in lids.values()]
-            height = 1.8 * float(np.mean([side[1] for side in sides]) - points[lips.ravel(), 1].mean())
-        contacts = {}
-        if lips is not None:
-            contacts["lips"] = _sides(face, lips, 0.07 * height)
-        for name, pairs in lids.items():
-            contacts[name] = _sides(face, pairs, 0.05 * height)
-        eyes = None
-        if len(lids) == 2:
-            eyes = np.stack([points[lids[name].ravel()].mean(0) for name in ("lids_left", "lids_right")])
-        return cls(
-            face,
-            height,
-            jaw_shape,
-            motion,
-            share,
-            jaw_vertices,
-            jaw_weights,
-            condyles,
-            jaw_pieces,
-            skull_pieces,
-            contacts,
-            None if lips is None else points[lips.ravel()].mean(0),
-            eyes,
-        )
-
-
-def _pose(
-    rest: Float[ndarray, "J 3"], moved: Float[ndarray, "J 3"], weights: ndarray, condyles: ndarray | None
-) -> tuple[ndarray, ndarray]:
-    """Rotation and translation of the jaw; its joints hold on to the skull where skin alone would leave them open."""
-    if condyles is not None:
-        rest, moved = np.concatenate([rest, condyles]), np.concatenate([moved, condyles])
-        weights = np.concatenate([weights, np.full(len(condyles), 0.15)])
-    rotation, translation = rigid_fit(
-        *(torch.from_numpy(np.ascontiguousarray(each)) for each in (rest, moved, weights))
-    )
-    return rotation.numpy(), translation.numpy()
-
-
-def _loose_pieces(rig: Rig, face: Face, jaw_shape: int, motion: tuple[ndarray, ndarray]) -> tuple[ndarray, ndarray]:
-    """Vertices of pieces that move with the jaw as one, and of pieces that never move."""
-    points, deltas = rig.neutral.double().numpy(), rig.deltas.double().numpy()
-    pieces = connected_pieces(rig.faces.numpy(), len(points))
-    own = np.unique(pieces[face.vertices])
-    opening = deltas[jaw_shape]
-    farthest = np.linalg.norm(opening, axis=1).max()
-    jaw, skull = [], []
-    for piece in np.setdiff1d(np.arange(pieces.max() + 1), own):
-        members = np.flatnonzero(pieces == piece)
-        if len(members) < 4:
-            continue
-        if np.abs(deltas[:, members]).max() < 0.01 * farthest:
-            skull.append(members)
-            continue
-        # As the jaw moves them: nearly rigidly, and far.
-        rest, moved = points[members], points[members] + opening[members]
-        rotation, translation = _pose(rest, moved, np.ones(len(members)), None)
-        miss = np.linalg.norm(rest @ rotation.T + translation - moved, axis=1).max()
-        as_jaw = np.linalg.norm(rest @ motion[0].T + motion[1] - moved, axis=1).mean()
-        travel = np.linalg.norm(opening[members], axis=1).mean()
-        if travel < 0.2 * farthest or miss > 0.15 * travel or as_jaw > 0.35 * travel:
-            continue
-        # A tongue rides on the jaw, but bends in shapes of its own.
-        bends = 0.0
-        for delta in deltas[:, members]:
-            if np.abs(delta).max() > 0.02 * farthest:
-                rotation, translation = _pose(rest, rest + delta, np.ones(len(members)), None)
-                bends = max(bends, np.linalg.norm(rest @ rotation.T + translation - rest - delta, axis=1).max())
-        if bends < 0.15 * travel:
-            jaw.append(members)
-    return tuple(np.concatenate(found) if found else np.zeros(0, np.int64) for found in (jaw, skull))
-
-
-def _edges(faces: Int[ndarray, "M 3"]) -> Int[ndarray, "E 2"]:
-    return np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-
-
-def _smoother(faces: Int[ndarray, "M 3"], count: int) -> csr_array:
-    """(N, N): each value half way to the mean of its neighbours."""
-    edges = _edges(faces)
-    ends = np.concatenate([edges, edges[:, ::-1]])
-    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count)).tocsr()
-    alone = np.asarray(graph.sum(1)) == 0
-    shares = 0.5 / np.maximum(graph.sum(1), 1)
-    return (diags_array(np.where(alone, 1.0, 0.5)) + diags_array(shares) @ graph).tocsr()
-
-
-def _repeated(smoother: csr_array, values: Float[ndarray, "*shape"], steps: int) -> Float[ndarray, "*shape"]:
-    for _ in range(steps):
-        values = smoother @ values
-    return values
-
-
-def _along(face_faces: ndarray, points: ndarray, starts: ndarray, limit: float = np.inf) -> Float[ndarray, "N"]:
-    """Distance along edges to the nearest of some vertices."""
-    edges = _edges(face_faces)
-    lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) + 1e-12
-    graph = coo_array((lengths, (edges[:, 0], edges[:, 1])), shape=(len(points),) * 2).tocsr()
-    return dijkstra(graph, directed=False, indices=starts, min_only=True, limit=limit)
-
-
-def _lips(face: Face, share: Float[ndarray, "N"], height: float) -> Int[ndarray, "P 2"] | None:
-    """Pairs of vertices of the face that lie on each other and part when the jaw opens, right to left."""
-    points = face.points
-    upper, lower = np.flatnonzero(share < 0.5), np.flatnonzero(share >= 0.5)
-    if len(upper) == 0 or len(lower) == 0:
-        return None
-    # Nearest across, mutual; and part: the mouth is open between them, they are no neighbours on one skin.
-    distance, there = cKDTree(points[lower]).query(points[upper])
-    _, back = cKDTree(points[upper]).query(points[lower])
-    mutual = back[there] == np.arange(len(upper))
-    jump = share[lower[there]] - share[upper]
-    facing = (face.normals[upper] * face.normals[lower[there]]).sum(1)
-    found = np.flatnonzero(mutual & (distance < 0.04 * height) & (jump > 0.25) & (facing < 0.5))
-    pairs = np.stack([upper[found], lower[there[found]]], 1)
-    if len(pairs):
-        joined = {tuple(edge) for edge in _edges(face.faces)}
-        pairs = pairs[[tuple(sorted(pair)) not in joined for pair in pairs.tolist()]]
-    if len(pairs) < 4:
-        return None
-    return pairs[np.argsort(points[pairs[:, 0], 0])]
-
-
-def _lids(face: Face, lips: ndarray | None, height: float) -> dict[str, Int[ndarray, "P 2"]]:
-    """Pairs above the mouth that lie apart at rest and on each other in one of the shapes, inner to outer corner."""
-    points = face.points
-    floor = points[lips.ravel(), 1].mean() + 0.2 * height if lips is not None else points[:, 1].mean()
-    region = np.flatnonzero((points[:, 1] > floor) & (face.strength > 0.3))
-    middle = float(np.median(points[face.strength > 0.1, 0]))
-    found: dict[str, ndarray] = {}
-    most = {"lids_left": 3, "lids_right": 3}
-    for delta in face.deltas[:, region]:
-        if np.linalg.norm(delta, axis=1).max() < 0.01 * height:
-            continue
-        posed, rest = points[region] + delta, points[region]
-        near = cKDTree(posed).query_pairs(0.02 * height, output_type="ndarray")
-        apart = np.linalg.norm(rest[near[:, 0]] - rest[near[:, 1]], axis=1)
-        shut = np.linalg.norm(posed[near[:, 0]] - posed[near[:, 1]], axis=1)
-        # Those that were far and met; of them the mutually closest.
-        met = near[(apart > 0.02 * height) & (shut < 0.35 * apart)]
-        if len(met) == 0:
-            continue
-        swap = rest[met[:, 0], 1] < rest[met[:, 1], 1]
-        met = np.where(swap[:, None], met[:, ::-1], met)
-        gaps = np.linalg.norm(posed[met[:, 0]] - posed[met[:, 1]], axis=1)
-        best = {}
-        for column in (0, 1):
-            order = np.argsort(gaps)
-            _, first = np.unique(met[order, column], return_index=True)
-            best[column] = set(order[first].tolist())
-        chosen = region[met[sorted(best[0] & best[1])]]
-        for name, left in (("lids_left", True), ("lids_right", False)):
-            side = chosen[(points[chosen[:, 0], 0] > middle) == left]
-            if len(side) > most[name]:
-                most[name] = len(side)
-                found[name] = side[np.argsort(np.abs(points[side[:, 0], 0] - middle))]
-    return found
-
-
-def _sides(face: Face, pairs: Int[ndarray, "P 2"], reach: float) -> Contact:
-    """The skin around both sides of a slit, each nearer to its own side along the surface."""
-    above = _along(face.faces, face.points, pairs[:, 0], 2 * reach)
-    below = _along(face.faces, face.points, pairs[:, 1], 2 * reach)
-    upper = np.flatnonzero((above < reach) & (above < below))
-    lower = np.flatnonzero((below < reach) & (below < above))
-    return Contact(*(torch.from_numpy(face.vertices[part]) for part in (upper, lower, pairs)))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -432,7 +192,7 @@ class Shell:
         marks = self.landmarks
         rest = self.rig.neutral.double().numpy()[marks.jaw_vertices]
         poses = [
-            _pose(rest, moved, marks.jaw_weights, marks.condyles)
+            rigid_pose(rest, moved, marks.jaw_weights, marks.condyles)
             for moved in vertices.double().numpy()[:, marks.jaw_vertices]
         ]
         return tuple(torch.from_numpy(np.stack(part)) for part in zip(*poses))
@@ -694,7 +454,7 @@ def _bent(
     faces = shell.skin_faces
     laplacian = cotangent_laplacian(shell.nodes[: len(shell)], torch.from_numpy(faces), low=1e-3)
     bending = laplacian.T @ laplacian
-    smoother = _smoother(faces, len(warped))
+    smoother = smoothing_matrix(faces, len(warped))
     upright = _normals(warped, faces)
     trust = confidence / confidence.max()
     for _ in range(12):
@@ -706,19 +466,19 @@ def _bent(
             break
         around = np.zeros(len(warped))
         around[faces[folded]] = 1.0
-        trust = trust * (1 - 0.9 * (places @ _repeated(smoother, around, 3)).clip(0, 0.3) / 0.3)
+        trust = trust * (1 - 0.9 * (places @ smoothed(smoother, around, 3)).clip(0, 0.3) / 0.3)
     return bent
 
 
 def _normals(points: ndarray, faces: ndarray) -> Float[ndarray, "F 3"]:
     a, b, c = points[faces].swapaxes(0, 1)
-    return _unit(np.cross(b - a, c - a))
+    return unit_vectors(np.cross(b - a, c - a))
 
 
 def _carried_layers(shell: Shell, bent: Float[ndarray, "N 3"]) -> Float[ndarray, "X 3"]:
     """Nodes under a bent skin: columns turn with the skin around them, and grow with it."""
     own = shell.nodes[: len(shell)].numpy()
-    edges = _edges(shell.skin_faces)
+    edges = mesh_edges(shell.skin_faces)
     moments = np.zeros((len(own), 3, 3))
     spans = [points[edges[:, 1]] - points[edges[:, 0]] for points in (own, bent)]
     products = np.einsum("ei,ej->eij", spans[1], spans[0])
@@ -742,7 +502,7 @@ def _local_scale(faces: ndarray, before: ndarray, after: ndarray) -> Float[ndarr
     """Root of how much larger the skin is around each vertex."""
     sums = [np.bincount(faces.ravel(), np.repeat(_areas(points, faces), 3)) for points in (before, after)]
     ratio = np.sqrt(sums[1] / np.maximum(sums[0], 1e-30))
-    return _repeated(_smoother(faces, len(ratio)), ratio, 4).clip(0.2, 5.0)
+    return smoothed(smoothing_matrix(faces, len(ratio)), ratio, 4).clip(0.2, 5.0)
 
 
 def _surface_sampler(
@@ -756,7 +516,7 @@ def _surface_sampler(
     numbers = np.full(len(rig.neutral), -1)
     numbers[face.vertices] = np.arange(len(face.vertices))
     local = followed[:, face.vertices]
-    rings = _smoother(face.faces, len(face.vertices))
+    rings = smoothing_matrix(face.faces, len(face.vertices))
     near = ((local != 0).astype(float) @ rings @ rings).tocsr()
     width = 24
     candidates = np.zeros((len(points), width), np.int64)
@@ -788,13 +548,13 @@ def _layers(
     rig: Rig, marks: Landmarks, skin: ndarray, faces: ndarray, thickness: ndarray, config: ShellConfig
 ) -> tuple[Float[ndarray, "L N 3"], Float[ndarray, "N"]]:
     """Nodes of every layer, and the thickness that was possible."""
-    height, smoother, steps = marks.height, _smoother(faces, len(skin)), config.smoothing
+    height, smoother, steps = marks.height, smoothing_matrix(faces, len(skin)), config.smoothing
     inward = _inward(skin, faces, smoother, steps)
-    depth = _repeated(smoother, thickness, steps)
+    depth = smoothed(smoother, thickness, steps)
     limit = float(depth.max() / config.own_share)
     own_reach, other_reach = _reaches(rig, marks.face, skin, faces, inward, limit)
     depth = np.minimum(depth, np.minimum(config.own_share * own_reach, config.other_share * other_reach))
-    depth = np.minimum(depth, _repeated(smoother, depth, steps))
+    depth = np.minimum(depth, smoothed(smoother, depth, steps))
     thinnest = 2e-3 * height
     depth = np.maximum(depth, thinnest)
     fractions = np.arange(config.layers + 1) / config.layers
@@ -833,7 +593,7 @@ def _untangled(
             if not failed.any():
                 return nodes
             near = np.isin(tets, tets[failed]).any(1)
-            _untangle(nodes, tets[near], goal[near], mobility, 30)
+            untangle(nodes, tets[near], goal[near], mobility, 30)
     return nodes
 
 
@@ -845,7 +605,7 @@ def _areas(points: ndarray, faces: ndarray) -> Float[ndarray, "F"]:
 def _inward(skin: ndarray, faces: ndarray, smoother: csr_array, steps: int) -> Float[ndarray, "N 3"]:
     """Smoothed directions into the flesh that stay on the inner side of every face around."""
     normals = vertex_normals(torch.from_numpy(skin), torch.from_numpy(faces)).numpy()
-    return _turned(skin, faces, -_unit(_repeated(smoother, normals, steps)), np.arange(len(skin)))
+    return _turned(skin, faces, -unit_vectors(smoothed(smoother, normals, steps)), np.arange(len(skin)))
 
 
 def _turned(skin: ndarray, faces: ndarray, inward: ndarray, chosen: Int[ndarray, "C"]) -> Float[ndarray, "N 3"]:
@@ -854,7 +614,7 @@ def _turned(skin: ndarray, faces: ndarray, inward: ndarray, chosen: Int[ndarray,
     eligible = np.isin(flat, chosen)
     flat, owner = flat[eligible], owner[eligible]
     a, b, c = skin[faces[owner]].swapaxes(0, 1)
-    normals = _unit(np.cross(b - a, c - a))
+    normals = unit_vectors(np.cross(b - a, c - a))
     inward = inward.copy()
     for _ in range(30):
         into = -(inward[flat] * normals).sum(1)
@@ -864,11 +624,11 @@ def _turned(skin: ndarray, faces: ndarray, inward: ndarray, chosen: Int[ndarray,
         push = np.zeros_like(inward)
         np.add.at(push, flat[wrong], -normals[wrong] * (0.15 - into[wrong])[:, None])
         moved = np.unique(flat[wrong])
-        inward[moved] = _unit(inward[moved] + push[moved])
+        inward[moved] = unit_vectors(inward[moved] + push[moved])
     return inward
 
 
-def _unit(vectors: ndarray) -> ndarray:
+def unit_vectors(vectors: ndarray) -> ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
 
 
@@ -877,14 +637,14 @@ def _reaches(
 ) -> tuple[Float[ndarray, "N"], Float[ndarray, "N"]]:
     """How far each column may go before it leaves its own flesh, and before it meets another part of the head."""
     corners = skin[faces]
-    own = _first_hits(skin, inward, corners, faces, limit, True)
+    own = first_hits(skin, inward, corners, faces, limit, True)
     points = rig.neutral.double().numpy()
     inside = np.zeros(len(points), bool)
     inside[face.vertices] = True
     outside = rig.faces.numpy()
     outside = outside[~inside[outside].any(1)]
     triangles = points[outside] if len(outside) else np.zeros((0, 3, 3))
-    return own, _first_hits(skin, inward, triangles, np.full((len(outside), 3), -1), limit, False)
+    return own, first_hits(skin, inward, triangles, np.full((len(outside), 3), -1), limit, False)
 
 
 def prisms(faces: Int[ndarray, "F 3"], count: int, layers: int) -> Int[ndarray, "M 4"]:
@@ -932,7 +692,7 @@ def _bones(marks: Landmarks, border: ndarray, depth: ndarray, config: ShellConfi
     label[slide > config.slide * depth] = 0
     for contact in marks.contacts.values():
         starts = np.flatnonzero(np.isin(face.vertices, torch.cat([contact.upper, contact.lower]).numpy()))
-        label[_along(face.faces, face.points, starts) < config.opening * marks.height] = 0
+        label[along_surface(face.faces, face.points, starts) < config.opening * marks.height] = 0
     still = face.strength < 0.02
     label[still | border] = SKULL
     bone = np.zeros((config.layers + 1, len(label)), np.int64)
@@ -1008,282 +768,3 @@ def _harmonic(rig: Rig, unknown: ndarray, numbers: ndarray, place: ndarray) -> c
     solved[np.abs(solved) < 1e-3] = 0
     entries = coo_array(solved)
     return coo_array((entries.data, (unknown[entries.row], touching[entries.col])), shape=(count, len(numbers)))
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Skin that passes through skin
-
-
-_DEEPEST = {"lips": 0.06, "lids_left": 0.03, "lids_right": 0.03}
-"""Share of H beyond which a point is taken to lie behind the other side, not in it: what lips and lids are thick."""
-
-
-def interpenetration(shell: Shell, vertices: Float[Tensor, "T V 3"]) -> dict[str, Float[Tensor, "T"]]:
-    """How deep the two sides of each contact lie in each other, metres; 0 where they do not.
-
-    A vertex of one side is inside the other where the closest point of that side's skin faces away from it, within 60
-    degrees of straight, and is no border of it. Its depth is the distance to that point. Where
-    sides already lie in each other at rest, as lips do in some sculpted neutrals, that depth counts too.
-    """
-    shell._check(vertices)
-    depths = {}
-    for name, contact in shell.contacts.items():
-        sides = [Side.of(shell.rig, side) for side in (contact.upper.numpy(), contact.lower.numpy())]
-        limit = _DEEPEST[name] * shell.height
-        frames = []
-        for mesh in vertices.double().numpy():
-            found = [first.depths(mesh, second, limit) for first, second in (sides, sides[::-1])]
-            frames.append(max(depth.max(initial=0.0) for depth in found))
-        depths[name] = torch.tensor(frames)
-    return depths
-
-
-@dataclass(frozen=True)
-class Side:
-    """One side of a contact: its vertices and the faces around them."""
-
-    vertices: ndarray
-    number: ndarray
-    """Vertices of the faces."""
-    local: ndarray
-    """Faces, as places in `number`."""
-    place: ndarray
-    """Of `vertices` in `number`."""
-    edge: ndarray
-    """Which of `number` are on the border of the faces."""
-
-    @classmethod
-    def of(cls, rig: Rig, vertices: Int[ndarray, "U"]) -> Side:
-        faces = rig.faces.numpy()
-        member = np.zeros(len(rig.neutral), bool)
-        member[vertices] = True
-        near = faces[member[faces].any(1)]  # one ring more, so that no member is a border
-        number, local = np.unique(near, return_inverse=True)
-        local = local.reshape(-1, 3)
-        edge = np.isin(np.arange(len(number)), boundary_edges(local))
-        return cls(vertices, number, local, np.searchsorted(number, vertices), edge)
-
-    def depths(self, mesh: ndarray, other: Side, limit: float) -> Float[ndarray, "U"]:
-        """How deep this side's vertices are inside the other."""
-        inside, distance, _, _, _ = self.hits(mesh, other, limit)
-        return np.where(inside, distance, 0.0)
-
-    def hits(
-        self, mesh: Float[ndarray, "V 3"], other: Side, limit: float, facing: bool = True
-    ) -> tuple[ndarray, ndarray, ndarray, ndarray, ndarray]:
-        """Which of this side's vertices are inside the other, how deep, and where they would come out.
-
-        Args:
-            mesh: Of the rig.
-            other: Whose surface they may have passed.
-            limit: Metres; what is farther behind the surface is not in it.
-            facing: Only vertices whose own normal is opposed to that of the other surface.
-
-        Returns:
-            (U,) inside; (U,) distance to the closest point; (U, 3) its corners, vertices of the rig; (U, 3) its shares;
-            (U, 3) its normal.
-        """
-        points, number, local = mesh[self.vertices], other.number, other.local
-        surface = mesh[number]
-        found, shares = closest_points(torch.from_numpy(points), torch.from_numpy(surface), torch.from_numpy(local))
-        corners, shares = local[found.numpy()], shares.double().numpy()
-        normals = vertex_normals(torch.from_numpy(surface), torch.from_numpy(local)).numpy()
-        places = (surface[corners] * shares[..., None]).sum(1)
-        normal = _unit((normals[corners] * shares[..., None]).sum(1))
-        away = points - places
-        distance = np.linalg.norm(away, axis=1)
-        # Beside the border of the other side nothing tells in from out; and skin that meets skin faces it.
-        on_edge = other.edge[corners].any(1) | (distance == 0)
-        flat = np.cross(
-            surface[corners[:, 1]] - surface[corners[:, 0]], surface[corners[:, 2]] - surface[corners[:, 0]]
-        )
-        # The way out of flesh runs along the normal; a way across it leads around an edge.
-        behind = ((away * normal).sum(1) < -0.5 * distance) & ((away * flat).sum(1) < 0)
-        inside = behind & ~on_edge & (distance < limit)
-        if facing:
-            own = vertex_normals(torch.from_numpy(mesh[self.number]), torch.from_numpy(self.local)).numpy()[self.place]
-            inside &= (own * normal).sum(1) < 0
-        return inside, distance, number[corners], shares, normal
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# Tetrahedra
-
-
-def tet_volumes(points: Float[ndarray, "X 3"], tets: Int[ndarray, "M 4"]) -> Float[ndarray, "M"]:
-    """Signed volume of each."""
-    a, b, c, d = points[tets].swapaxes(0, 1)
-    return np.einsum("mi,mi->m", np.cross(b - a, c - a), d - a) / 6
-
-
-def hat_gradients(points: Float[ndarray, "X 3"], tets: Int[ndarray, "M 4"]) -> Float[ndarray, "M 4 3"]:
-    """Gradient of each corner's hat function."""
-    corners = points[tets]
-    edges = (corners[:, 1:] - corners[:, :1]).swapaxes(1, 2)  # as columns
-    slopes = np.linalg.inv(edges)  # rows are gradients of the second to fourth corner
-    return np.ascontiguousarray(np.concatenate([-slopes.sum(1, keepdims=True), slopes], 1))
-
-
-def stiffness_matrix(
-    vectors: Float[ndarray, "M 4 3"], tets: Int[ndarray, "M 4"], weights: Float[ndarray, "M"], count: int
-) -> csr_array:
-    """Matrix K with x K x = sum of weight |F|^2 for each coordinate x of the nodes."""
-    blocks = np.einsum("mai,mbi->mab", vectors, vectors) * weights[:, None, None]
-    rows, columns = np.repeat(tets, 4, axis=1).ravel(), np.tile(tets, (1, 4)).ravel()
-    return coo_array((blocks.ravel(), (rows, columns)), shape=(count, count)).tocsr()
-
-
-def factored(matrix) -> SuperLU:
-    """Factors of a symmetric, positive definite matrix, without pivoting."""
-    return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-
-
-def _compiled(function: Callable) -> Callable:
-    # An import hook that checks types, as in our tests, wraps every function; the compiler needs the bare one.
-    return numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)(inspect.unwrap(function))
-
-
-@_compiled
-def scatter(sides, tets, vectors, matrices):
-    """Adds matrix x vector of each corner to its node's row: the right side for wanted gradients."""
-    for e in range(len(tets)):
-        for c in range(4):
-            node = tets[e, c]
-            for i in range(3):
-                total = 0.0
-                for j in range(3):
-                    total += matrices[e, i, j] * vectors[e, c, j]
-                sides[node, i] += total
-
-
-@_compiled
-def nearest_rotations(points, tets, vectors, turns, steps):
-    """Rotations closest to the gradients, from those of the last time, in place; a few steps of a safe iteration.
-
-    Source: Müller et al. 2016, "A robust method to extract the rotational part of deformations",
-    doi:10.1145/2994258.2994269; it is never a reflection, even where a tetrahedron is turned inside out.
-    """
-    f, r = np.empty((3, 3)), np.empty((3, 3))
-    for e in range(len(tets)):
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for c in range(4):
-                    total += points[tets[e, c], i] * vectors[e, c, j]
-                f[i, j] = total
-                r[i, j] = turns[e, i, j]
-        for _ in range(steps):
-            if turn_towards(f, r) < 1e-6:
-                break
-        for i in range(3):
-            for j in range(3):
-                turns[e, i, j] = r[i, j]
-
-
-@_compiled
-def turn_towards(f, r):
-    """One step of a rotation, in place, towards the matrix; returns the square of its angle."""
-    x = y = z = 0.0
-    along = 0.0
-    for j in range(3):
-        x += r[1, j] * f[2, j] - r[2, j] * f[1, j]
-        y += r[2, j] * f[0, j] - r[0, j] * f[2, j]
-        z += r[0, j] * f[1, j] - r[1, j] * f[0, j]
-        along += r[0, j] * f[0, j] + r[1, j] * f[1, j] + r[2, j] * f[2, j]
-    scale = 1.0 / (abs(along) + 1e-9)
-    x, y, z = x * scale, y * scale, z * scale
-    square = x * x + y * y + z * z
-    # Rotation by Rodrigues with half the tangent: (1 - w^2/4 ...) is the exact Cayley map of the vector.
-    k = 2.0 / (4.0 + square)
-    for j in range(3):
-        a, b, c = r[0, j], r[1, j], r[2, j]
-        u, v, w = y * c - z * b, z * a - x * c, x * b - y * a
-        r[0, j] = a + k * (2.0 * u + (y * w - z * v))
-        r[1, j] = b + k * (2.0 * v + (z * u - x * w))
-        r[2, j] = c + k * (2.0 * w + (x * v - y * u))
-    return square
-
-
-@_compiled
-def _untangle(nodes, tets, least, mobility, sweeps):
-    """Moves nodes, in place, until each tetrahedron has its least volume; whether they all have.
-
-    Source: the projection of position-based dynamics (Müller et al. 2007) on the volume of one after another.
-    """
-    for _ in range(sweeps):
-        done = True
-        for e in range(len(tets)):
-            a, b, c, d = nodes[tets[e, 0]], nodes[tets[e, 1]], nodes[tets[e, 2]], nodes[tets[e, 3]]
-            slopes = np.empty((4, 3))
-            for corner in range(3):
-                u, v = (c - a, d - a) if corner == 0 else ((d - a, b - a) if corner == 1 else (b - a, c - a))
-                slopes[corner + 1, 0] = (u[1] * v[2] - u[2] * v[1]) / 6
-                slopes[corner + 1, 1] = (u[2] * v[0] - u[0] * v[2]) / 6
-                slopes[corner + 1, 2] = (u[0] * v[1] - u[1] * v[0]) / 6
-            slopes[0] = -(slopes[1] + slopes[2] + slopes[3])
-            volume = 0.0
-            for i in range(3):
-                volume += (b[i] - a[i]) * slopes[1, i]
-            if volume >= least[e]:
-                continue
-            done = False
-            total = 1e-300
-            for corner in range(4):
-                for i in range(3):
-                    total += mobility[tets[e, corner]] * slopes[corner, i] ** 2
-            step = (1.1 * least[e] - volume) / total
-            for corner in range(4):
-                for i in range(3):
-                    nodes[tets[e, corner], i] += step * mobility[tets[e, corner]] * slopes[corner, i]
-        if done:
-            return True
-    return False
-
-
-@_compiled
-def _first_hits(origins, directions, triangles, corners, limit, own):
-    """Distance along each ray to the first triangle; own ones count from inside only, and not around the origin."""
-    reach = np.full(len(origins), np.inf)
-    centres = np.empty((len(triangles), 3))
-    radii = np.empty(len(triangles))
-    for f in range(len(triangles)):
-        for i in range(3):
-            centres[f, i] = (triangles[f, 0, i] + triangles[f, 1, i] + triangles[f, 2, i]) / 3
-        radius = 0.0
-        for c in range(3):
-            square = 0.0
-            for i in range(3):
-                square += (triangles[f, c, i] - centres[f, i]) ** 2
-            radius = max(radius, square)
-        radii[f] = np.sqrt(radius)
-    for n in range(len(origins)):
-        ox, oy, oz = origins[n, 0], origins[n, 1], origins[n, 2]
-        dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
-        mx, my, mz = ox + dx * limit / 2, oy + dy * limit / 2, oz + dz * limit / 2
-        for f in range(len(triangles)):
-            gap = limit / 2 + radii[f]
-            if (centres[f, 0] - mx) ** 2 + (centres[f, 1] - my) ** 2 + (centres[f, 2] - mz) ** 2 > gap * gap:
-                continue
-            if corners[f, 0] == n or corners[f, 1] == n or corners[f, 2] == n:
-                continue
-            t = triangles[f]
-            ax, ay, az = t[1, 0] - t[0, 0], t[1, 1] - t[0, 1], t[1, 2] - t[0, 2]
-            bx, by, bz = t[2, 0] - t[0, 0], t[2, 1] - t[0, 1], t[2, 2] - t[0, 2]
-            nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-            facing = nx * dx + ny * dy + nz * dz
-            if own and facing <= 0:
-                continue
-            if abs(facing) < 1e-300:
-                continue
-            px, py, pz = ox - t[0, 0], oy - t[0, 1], oz - t[0, 2]
-            along = -(nx * px + ny * py + nz * pz) / facing
-            if along <= 0 or along >= min(limit, reach[n]):
-                continue
-            hx, hy, hz = px + along * dx, py + along * dy, pz + along * dz
-            aa, ab, bb = ax * ax + ay * ay + az * az, ax * bx + ay * by + az * bz, bx * bx + by * by + bz * bz
-            ha, hb = hx * ax + hy * ay + hz * az, hx * bx + hy * by + hz * bz
-            area = aa * bb - ab * ab
-            v, w = (bb * ha - ab * hb) / area, (aa * hb - ab * ha) / area
-            if v >= 0 and w >= 0 and v + w <= 1:
-                reach[n] = along
-    return reach

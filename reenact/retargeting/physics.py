@@ -32,15 +32,9 @@ from scipy.sparse import coo_array, diags_array
 from torch import Tensor
 
 from reenact.errors import ReenactError
-from reenact.retargeting.anatomy import (
-    Shell,
-    Side,
-    _compiled,
-    factored,
-    nearest_rotations,
-    stiffness_matrix,
-    turn_towards,
-)
+from reenact.retargeting.anatomy import Shell
+from reenact.retargeting.contact import Side
+from reenact.retargeting.tetrahedra import compiled, factored, nearest_rotations, stiffness_matrix, turn_towards
 
 _GRAVITY = 0.125
 """Half of density x gravity x height of the face / shear modulus: 1,000 kg/m^3, 9.8 m/s^2, 0.125 m, 5 kPa."""
@@ -392,7 +386,7 @@ def feature_vectors(shell: Shell, values: Float[Tensor, "T C 3"]) -> Float[Tenso
 # Local steps
 
 
-@_compiled
+@compiled
 def _stretches(points, tets, vectors, turns, stretches):
     """S = R^T F of each tetrahedron, made symmetric, in place."""
     f, s = np.empty((3, 3)), np.empty((3, 3))
@@ -411,7 +405,7 @@ def _stretches(points, tets, vectors, turns, stretches):
                 stretches[e, i, j] = 0.5 * (s[i, j] + s[j, i])
 
 
-@_compiled
+@compiled
 def _project(points, tets, vectors, weights, band, turns, muscle_turns, stretches, sides):
     """Adds what elasticity, volume and muscles ask for to the right side; turns go on from the last step."""
     f, r, p, cofactor = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
