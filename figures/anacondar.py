@@ -4,7 +4,7 @@
 
 anacondar-patches.png      80 patches of the source, and the same ones on the target
 anacondar-components.png   frames of a clip: source, parts of the method, result, truth, with the distance from truth
-anacondar-gravity.png      one expression without weight, upright, and hanging head down
+anacondar-gravity.png      one expression without weight, and in a centrifuge
 anacondar-stiffness.png    the same under gravity with soft, usual and stiff cheeks
 """
 
@@ -126,7 +126,7 @@ def draw_components(method: Anacondar, transfer: DeformationTransfer, plain: Pat
 def draw_forces(source: Rig, target: Rig, settings: dict, folder: Path) -> None:
     """Soft tissue whose skin holds on little, in a centrifuge: a cheek that holds on to its bone sags little at 1 g."""
     frame = source.vertices(weights(source))[:1]
-    config = AnacondarConfig(physics=PhysicsConfig(skin=1.0, elasticity=0.3, muscle=0.3))
+    config = AnacondarConfig(physics=PhysicsConfig(skin=1.0, elasticity=0.3, muscle=0.3, iterations=60))
     method = Anacondar(source, target, config=config, **settings)
     rest = method.stages(frame).vertices[0]
     row, heats = [(picture(target, rest), "no weight")], [(np.ones((SIZE, SIZE, 3)), "")]
@@ -145,7 +145,7 @@ def draw_forces(source: Rig, target: Rig, settings: dict, folder: Path) -> None:
 
     cheeks = cheek_field(method.shell)
     row, heats = [], []
-    for title, factor in (("soft cheeks, 1/4", 0.25), ("as built", 1.0), ("stiff cheeks, 8", 8.0)):
+    for title, factor in (("soft cheeks, 1/10", 0.1), ("as built", 1.0), ("stiff cheeks, 30", 30.0)):
         edited = Anacondar(
             source, target, config=config, stiffness=1 + (factor - 1) * cheeks, shell=method.shell, **settings
         )
@@ -160,11 +160,11 @@ def draw_forces(source: Rig, target: Rig, settings: dict, folder: Path) -> None:
 
 
 def cheek_field(shell: Shell) -> Tensor:
-    """(V,) 1 in the middle of both cheeks, fading to 0."""
+    """(V,) 1 in the lower middle of both cheeks, fading to 0."""
     rig, marks = shell.rig, shell.landmarks
     field = torch.zeros(len(rig.neutral))
     for eye in marks.eyes:
-        middle = torch.from_numpy(0.35 * eye + 0.65 * marks.mouth).float()
+        middle = torch.from_numpy(0.1 * eye + 0.9 * marks.mouth).float()
         middle[0] = 1.15 * float(eye[0])
         flat = (rig.neutral - middle)[:, :2].norm(dim=-1) / (0.22 * shell.height)
         field = torch.maximum(

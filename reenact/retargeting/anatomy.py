@@ -380,7 +380,7 @@ def build_shell(rig: Rig, thickness: Float[Tensor, "V"] | None = None, config: S
         layer=np.repeat(np.arange(config.layers), 3 * len(face.faces)),
         bone=bone,
         border=np.tile(border, config.layers + 1),
-        thickness=depth,
+        thickness=np.linalg.norm(layers[-1] - layers[0], axis=1),
         jaw_share=marks.jaw_share,
         slits=slits,
         config=config,
