@@ -78,7 +78,7 @@ def show(rows: list[list[tuple[np.ndarray, str]]], path: Path) -> None:
             axis.imshow(pixels)
             axis.set_title(title, fontsize=9)
     figure.tight_layout(pad=0.4)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=80, pil_kwargs={"optimize": True})
     plt.close(figure)
     print(path)
 
