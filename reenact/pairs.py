@@ -42,6 +42,8 @@ class Pairs:
     """The pairs that both rigs agree on: source shape, target shape."""
     strength: Float[Tensor, "Ks"]
     """How much each source shape moves, root of the summed squares of its motion pass."""
+    likeness: Float[Tensor, "Ks Kt"]
+    """Correlation of the looks of every two shapes."""
 
     def weights(self, source_weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"]:
         """Weights of the target for expressions of the source, in [0, 1]."""
@@ -94,9 +96,9 @@ class Teacher:
     """What a person said of some expressions."""
 
     @property
-    def agreed(self) -> tuple[tuple[int, int], ...]:
-        """Shapes that are taken to be one: source shape, target shape."""
-        return self.pictures.agreed if self.geometry is None else self.geometry.partners
+    def agreed(self) -> set[int]:
+        """Shapes of the source that are taken to mean shapes of the target, at any strength."""
+        return {k for k, _ in self.pictures.agreed} if self.geometry is None else self.geometry.partners.ours
 
     def weights(self, source_weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"]:
         """Weights of the target for expressions of the source, in [0, 1].
@@ -154,7 +156,10 @@ def find_teacher(
         ReenactError: The correspondence belongs to other rigs, or there is neither it nor a motion pass.
     """
     pictures = find_pairs(source, target, config) if "motion" in source.buffers else None
-    geometry = None if correspondence is None else Labels(source.rig, target.rig, correspondence)
+    geometry = None
+    if correspondence is not None:
+        likeness = None if pictures is None else pictures.likeness
+        geometry = Labels(source.rig, target.rig, correspondence, likeness)
     if pictures is None and geometry is None:
         raise ReenactError(
             f"{source.rig.name} to {target.rig.name}: expected a correspondence, or images.motion, to learn from; the "
@@ -188,7 +193,7 @@ def find_pairs(source: Studio, target: Studio, config: PairsConfig) -> Pairs:
         mixture = lsq_linear(triangle.numpy(), wanted[k].numpy(), bounds=(0, 1)).x
         matrix[k] = torch.from_numpy(mixture).float()
         similarity[k] = (_unit(ours[k : k + 1]) @ _unit((matrix[k] @ theirs)[None]).T).clamp_min(0)
-    return Pairs(matrix, similarity, agreed, strength)
+    return Pairs(matrix, similarity, agreed, strength, correlation)
 
 
 def _agreed(correlation: Tensor, config: PairsConfig) -> tuple[tuple[int, int], ...]:

@@ -218,14 +218,14 @@ def _find_teachers(run: Run, studios: dict[str, Studio], console: Console) -> di
             trust = teacher.confidence(single, told)
             words[f"{source} -> {target}"] = {
                 names[0][k]: {
-                    "agreed": any(k == pair[0] for pair in teacher.agreed),
+                    "agreed": k in teacher.agreed,
                     "confidence": round(float(trust[k]), 3),
                     "shapes": {names[1][j]: round(value, 3) for j, value in enumerate(row) if value > 0.005},
                 }
                 for k, row in enumerate(told.tolist())
             }
             console.print(
-                f"{source} -> {target}: {len(teacher.agreed)} of {len(names[0])} shapes are one of the other rig's, "
+                f"{source} -> {target}: {len(teacher.agreed)} of {len(names[0])} shapes have partners there, "
                 "the rest are mixtures",
                 soft_wrap=True,
             )

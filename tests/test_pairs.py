@@ -60,7 +60,7 @@ def test_only_clear_mutual_best_matches_are_agreed_on():
 
 
 def test_confidence_is_that_of_the_shapes_that_move():
-    pairs = Pairs(torch.eye(2), torch.tensor([1.0, 0.5]), ((0, 0),), torch.tensor([3.0, 1.0]))
+    pairs = Pairs(torch.eye(2), torch.tensor([1.0, 0.5]), ((0, 0),), torch.tensor([3.0, 1.0]), torch.eye(2))
     confidence = pairs.confidence(torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [0.0, 0.0]]))
     torch.testing.assert_close(confidence, torch.tensor([1.0, 0.25, (3 + 0.25) / 4, 0.0]))
 

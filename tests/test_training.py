@@ -199,7 +199,7 @@ def test_the_loss_through_the_renderer_is_left_out_where_no_picture_of_its_own_i
 
 
 def test_rigs_with_nothing_in_common_still_train(toy_config, tmp_path, monkeypatch):
-    nothing = Teacher(Pairs(torch.zeros(7, 7), torch.zeros(7), (), torch.ones(7)), None)
+    nothing = Teacher(Pairs(torch.zeros(7, 7), torch.zeros(7), (), torch.ones(7), torch.zeros(7, 7)), None)
     monkeypatch.setattr(Run, "teacher", lambda *_: nothing)
     train(replace(toy_config, run=str(tmp_path / "run")))
     assert all(torch.isfinite(value).all() for value in _weights(tmp_path / "run").values())
