@@ -68,6 +68,9 @@ class PairsConfig:
     """Least correlation of the motion passes of two shapes that count as one in pictures."""
     margin: float = 0.05
     """By how much the next best shape must correlate less."""
+    nudges: str | None = None
+    """A file of corrections made in the viewer, such as another run's nudges.json: the networks are taught expressions
+    near a corrected frame as it was left."""
 
 
 @dataclass(frozen=True)
@@ -314,6 +317,10 @@ def check_config(config: Config, origin: str = "settings") -> None:
         raise ReenactError(
             f'{origin}: pairs.method: expected images.motion beside "pictures", got none; colours alone pair the wrong '
             'shapes, set pairs.method to "geometry" or "none"'
+        )
+    if config.pairs.nudges is not None and config.pairs.method == "none":
+        raise ReenactError(
+            f'{origin}: pairs.nudges: expected a pairs.method to correct, got "none"; set "geometry" or "pictures"'
         )
     if config.images.motion and not config.images.residual:
         raise ReenactError(

@@ -8,7 +8,7 @@ either moves (the "range of motion" of Ribera et al. 2017); shapes without a par
 rig's shapes that comes closest, amplitudes and all.
 
 `Teacher` joins these pairs with the labels that geometry gives (`reenact.retargeting.labels`), where a correspondence
-between the meshes is found.
+between the meshes is found, and with corrections that a person made, which overrule both around them.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.labels import Labels
 
+_REACH = 0.3
+"""Of a correction, in shares of the size of the corrected expression."""
+
 
 @dataclass(frozen=True)
 class Pairs:
@@ -39,6 +42,8 @@ class Pairs:
     """The pairs that both rigs agree on: source shape, target shape."""
     strength: Float[Tensor, "Ks"]
     """How much each source shape moves, root of the summed squares of its motion pass."""
+    likeness: Float[Tensor, "Ks Kt"]
+    """Correlation of the looks of every two shapes."""
 
     def weights(self, source_weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"]:
         """Weights of the target for expressions of the source, in [0, 1]."""
@@ -51,6 +56,35 @@ class Pairs:
 
 
 @dataclass(frozen=True)
+class Corrections:
+    """Expressions of a source, and what a person made the target do then; at least one. Ours.
+
+    Nearness is a Gaussian of the distance between two expressions, each shape counted by how much it moves, with a
+    deviation of `_REACH` of the corrected expression's own size. Offsets between corrected expressions are interpolated
+    by these Gaussians, so that each is exactly as the person left it, and what is far from all is as it was.
+    """
+
+    source_weights: Float[Tensor, "N Ks"]
+    weights: Float[Tensor, "N Kt"]
+    strength: Float[Tensor, "Ks"]
+    """How much each source shape moves, in any unit."""
+
+    def nearness(self, source_weights: Float[Tensor, "M Ks"]) -> Float[Tensor, "M N"]:
+        """1 at a corrected expression, 0 far from it."""
+        corrected = self.source_weights * self.strength
+        size = corrected.norm(dim=1).clamp_min(0.5 * float(self.strength.median()))  # a face at rest has a reach too
+        return torch.exp(-(torch.cdist(source_weights * self.strength, corrected) / (_REACH * size)).square() / 2)
+
+    def offsets(
+        self, source_weights: Float[Tensor, "M Ks"], uncorrected: Float[Tensor, "N Kt"]
+    ) -> Float[Tensor, "M Kt"]:
+        """What to add to uncorrected weights; `uncorrected` are those of the corrected expressions."""
+        among = self.nearness(self.source_weights).double()
+        amounts = torch.linalg.lstsq(among, (self.weights - uncorrected).double(), driver="gelsd").solution
+        return (self.nearness(source_weights).double() @ amounts).float()
+
+
+@dataclass(frozen=True)
 class Teacher:
     """What networks are taught of one rig's expressions on another; at least one of its two sources is there. Ours."""
 
@@ -58,11 +92,13 @@ class Teacher:
     """Shapes that look alike."""
     geometry: Labels | None
     """Shapes that move corresponding places alike."""
+    corrections: Corrections | None = None
+    """What a person said of some expressions."""
 
     @property
-    def agreed(self) -> tuple[tuple[int, int], ...]:
-        """Shapes that are taken to be one: source shape, target shape."""
-        return self.pictures.agreed if self.geometry is None else self.geometry.partners
+    def agreed(self) -> set[int]:
+        """Shapes of the source that are taken to mean shapes of the target, at any strength."""
+        return {k for k, _ in self.pictures.agreed} if self.geometry is None else self.geometry.partners.ours
 
     def weights(self, source_weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"]:
         """Weights of the target for expressions of the source, in [0, 1].
@@ -72,6 +108,13 @@ class Teacher:
         in them, which leaves them out where the target cannot look like the source. (The power was chosen on
         `anny:merged` and `anny:units`.)
         """
+        told = self._uncorrected(source_weights)
+        if self.corrections is None:
+            return told
+        offsets = self.corrections.offsets(source_weights, self._uncorrected(self.corrections.source_weights))
+        return (told + offsets).clamp(0, 1)
+
+    def _uncorrected(self, source_weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"]:
         if self.geometry is None:
             return self.pictures.weights(source_weights)
         told = self.geometry.weights(source_weights)
@@ -85,12 +128,20 @@ class Teacher:
     ) -> Float[Tensor, "N"]:
         """How far to believe the weights of each expression, in [0, 1]; `weights` are those, where they are at hand."""
         if self.geometry is None:
-            return self.pictures.confidence(source_weights)
-        return self.geometry.confidence(source_weights, weights)
+            trust = self.pictures.confidence(source_weights)
+        else:
+            trust = self.geometry.confidence(source_weights, weights)
+        if self.corrections is None:
+            return trust
+        return torch.maximum(trust, self.corrections.nearness(source_weights).amax(1))
 
 
 def find_teacher(
-    source: Studio, target: Studio, config: PairsConfig, correspondence: Correspondence | None = None
+    source: Studio,
+    target: Studio,
+    config: PairsConfig,
+    correspondence: Correspondence | None = None,
+    corrected: tuple[Float[Tensor, "N Ks"], Float[Tensor, "N Kt"]] | None = None,
 ) -> Teacher:
     """What is known of the source's expressions on the target before any training.
 
@@ -99,18 +150,25 @@ def find_teacher(
         target: Studio of the rig that it goes to, in the same layout.
         config: What to learn from; anything but "none".
         correspondence: From the source's surface to the target's, for "geometry"; pictures teach alone without.
+        corrected: Expressions of the source, and of the target as a person wants it then.
 
     Raises:
         ReenactError: The correspondence belongs to other rigs, or there is neither it nor a motion pass.
     """
     pictures = find_pairs(source, target, config) if "motion" in source.buffers else None
-    geometry = None if correspondence is None else Labels(source.rig, target.rig, correspondence)
+    geometry = None
+    if correspondence is not None:
+        likeness = None if pictures is None else pictures.likeness
+        geometry = Labels(source.rig, target.rig, correspondence, likeness)
     if pictures is None and geometry is None:
         raise ReenactError(
             f"{source.rig.name} to {target.rig.name}: expected a correspondence, or images.motion, to learn from; the "
             'surfaces are too large to register: give pairs.correspondence, or set pairs.method to "none"'
         )
-    return Teacher(pictures, geometry)
+    if corrected is None or not len(corrected[0]):
+        return Teacher(pictures, geometry)
+    strength = source.glance(torch.eye(len(source.rig.names))).flatten(1).norm(dim=1)
+    return Teacher(pictures, geometry, Corrections(*corrected, strength))
 
 
 @torch.no_grad()
@@ -135,7 +193,7 @@ def find_pairs(source: Studio, target: Studio, config: PairsConfig) -> Pairs:
         mixture = lsq_linear(triangle.numpy(), wanted[k].numpy(), bounds=(0, 1)).x
         matrix[k] = torch.from_numpy(mixture).float()
         similarity[k] = (_unit(ours[k : k + 1]) @ _unit((matrix[k] @ theirs)[None]).T).clamp_min(0)
-    return Pairs(matrix, similarity, agreed, strength)
+    return Pairs(matrix, similarity, agreed, strength, correlation)
 
 
 def _agreed(correlation: Tensor, config: PairsConfig) -> tuple[tuple[int, int], ...]:

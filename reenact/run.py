@@ -28,6 +28,7 @@ from reenact.data import Studio
 from reenact.errors import ReenactError
 from reenact.layout import find_layout, lay_out
 from reenact.models import Networks
+from reenact.nudges import Nudges, labels, load_nudges, save_nudges
 from reenact.pairs import Teacher, find_teacher
 from reenact.retargeting.correspondence import (
     Correspondence,
@@ -44,6 +45,8 @@ _LAYOUT_RESOLUTION = 64
 MOST_VERTICES = 50_000
 """Of rigs whose surfaces are registered, unless pairs are given. With 100,000 a quarter of an hour was not enough.
 Beyond, pictures teach alone."""
+_TAUGHT = "taught.json"
+"""Corrections that the networks learn from, in the run folder; nudges.json there is the viewer's."""
 _FILE = re.compile(r"(\d+)-(.+)\.npz")
 
 
@@ -93,6 +96,8 @@ class Run:
                 if clip is not None:
                     (whole / "clips").mkdir(exist_ok=True)
                     save_clip(clip, whole / "clips" / f"{index}-{key}.npz")
+            if config.pairs.nudges is not None:
+                save_nudges(_usable_nudges(config.pairs.nudges, keyed), whole / _TAUGHT)
             correspondences = _find_correspondences(keyed, config)
             for (first, second), correspondence in correspondences.items():
                 (whole / "correspondences").mkdir(exist_ok=True)
@@ -159,7 +164,11 @@ class Run:
         """
         there = self.correspondences.get((source_key, target_key))
         back = self.correspondences.get((target_key, source_key))
-        return find_teacher(source, target, self.config.pairs, back.reversed() if there is None and back else there)
+        corrected = None
+        if self.config.pairs.nudges is not None:
+            corrected = labels(load_nudges(self.folder / _TAUGHT), source_key, target_key)[:2]
+        known = back.reversed() if there is None and back else there
+        return find_teacher(source, target, self.config.pairs, known, corrected)
 
     def networks(self) -> Networks:
         """Untrained networks of the run's shape, initialised from its seed."""
@@ -247,6 +256,28 @@ def _load_correspondences(folder: Path, config: Config, rigs: dict[str, Rig]) ->
             raise ReenactError(f"{path}: expected the pairs of places of the run, got no file; train again")
         found[first, second] = load_correspondence(path, rigs[first], rigs[second])
     return found
+
+
+def _usable_nudges(path: str, rigs: dict[str, Rig]) -> Nudges:
+    """The nudges of these rigs in a file, under the keys of the run; a viewer without a run knows rigs by name."""
+    found = load_nudges(path)
+    known = {
+        name: key
+        for key, rig in rigs.items()
+        for name, shapes in found.rigs.items()
+        if name in (key, rig.name) and shapes == rig.names
+    }
+    items = tuple(
+        replace(nudge, source=known[nudge.source], rig=known[nudge.rig])
+        for nudge in found.items
+        if nudge.source in known and nudge.rig in known and nudge.source != nudge.rig
+    )
+    if not items:
+        raise ReenactError(
+            f"{path}: expected corrected frames of {' or '.join(rigs)} with the shapes of today, got "
+            f"{len(found.items)} of {', '.join(found.rigs) or 'no rig'}"
+        )
+    return Nudges({key: rig.names for key, rig in rigs.items()}, items)
 
 
 def _registered(rigs: dict[str, Rig], config: Config) -> list[tuple[str, str]]:

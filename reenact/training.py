@@ -43,6 +43,8 @@ _CHUNK = 64
 """Expressions that are photographed at once; part of what makes a run repeatable."""
 _LEAST_TRUST = 0.2
 """In what a teacher says of any expression: doubtful labels of all expressions beat sure ones of a few."""
+_NEAR = 64
+"""Expressions near each corrected one, of a quarter of all at most."""
 _LOG_EVERY = 20
 """Steps between lines of metrics.jsonl; each holds the mean since the last."""
 
@@ -216,14 +218,14 @@ def _find_teachers(run: Run, studios: dict[str, Studio], console: Console) -> di
             trust = teacher.confidence(single, told)
             words[f"{source} -> {target}"] = {
                 names[0][k]: {
-                    "agreed": any(k == pair[0] for pair in teacher.agreed),
+                    "agreed": k in teacher.agreed,
                     "confidence": round(float(trust[k]), 3),
                     "shapes": {names[1][j]: round(value, 3) for j, value in enumerate(row) if value > 0.005},
                 }
                 for k, row in enumerate(told.tolist())
             }
             console.print(
-                f"{source} -> {target}: {len(teacher.agreed)} of {len(names[0])} shapes are one of the other rig's, "
+                f"{source} -> {target}: {len(teacher.agreed)} of {len(names[0])} shapes have partners there, "
                 "the rest are mixtures",
                 soft_wrap=True,
             )
@@ -283,6 +285,7 @@ def _render(shop: _Workshop, key: str, seed: list[int], partners: list[str], pic
     place = list(shop.studios).index(key)
     count, elastic = shop.config.training.frames, shop.config.training.elastic
     weights = shop.studios[key].draw(count, np.random.default_rng([*seed, place]))
+    weights = _corrected_first(shop, key, weights, seed)
     net, random = shop.networks.reenactnet, _torch_random([*seed, place])
     parts, bent = [], []
     for chunk in weights.split(_CHUNK):
@@ -302,6 +305,21 @@ def _render(shop: _Workshop, key: str, seed: list[int], partners: list[str], pic
             trust = teacher.confidence(weights, theirs).clamp_min(_LEAST_TRUST)
             found[other] = _Partners(theirs, torch.cat(pictures) if pictured else None, trust)
     return _Pool(weights, described, seen, found)
+
+
+def _corrected_first(shop: _Workshop, key: str, weights: Tensor, seed: list[int]) -> Tensor:
+    """Expressions of which the first are drawn towards corrected ones: half to all of the way, `_NEAR` per correction.
+
+    Random ones would hardly ever come near. Ours.
+    """
+    teachers = [teacher for (source, _), teacher in shop.teachers.items() if source == key]
+    corrected = [teacher.corrections.source_weights for teacher in teachers if teacher.corrections is not None]
+    if not corrected:
+        return weights
+    random = _torch_random([*seed, list(shop.studios).index(key), 1])
+    centres = torch.cat(corrected).repeat(_NEAR, 1)[: len(weights) // 4]
+    share = 0.5 + 0.5 * torch.rand(len(centres), 1, generator=random)
+    return torch.cat([torch.lerp(weights[: len(centres)], centres, share), weights[len(centres) :]])
 
 
 def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Generator, done: float) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ import torch
 from reenact.config import ImageConfig, LayoutConfig, PairsConfig
 from reenact.data import Studio
 from reenact.layout import find_layout
-from reenact.pairs import Pairs, _agreed, find_pairs
+from reenact.pairs import Pairs, _agreed, find_pairs, find_teacher
 from reenact.rigs import anny
 
 SMALL = ImageConfig(resolution=32)
@@ -60,6 +60,27 @@ def test_only_clear_mutual_best_matches_are_agreed_on():
 
 
 def test_confidence_is_that_of_the_shapes_that_move():
-    pairs = Pairs(torch.eye(2), torch.tensor([1.0, 0.5]), ((0, 0),), torch.tensor([3.0, 1.0]))
+    pairs = Pairs(torch.eye(2), torch.tensor([1.0, 0.5]), ((0, 0),), torch.tensor([3.0, 1.0]), torch.eye(2))
     confidence = pairs.confidence(torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [0.0, 0.0]]))
     torch.testing.assert_close(confidence, torch.tensor([1.0, 0.25, (3 + 0.25) / 4, 0.0]))
+
+
+def test_a_corrected_expression_is_as_it_was_left_and_others_far_away_are_as_they_were(toy_pair):
+    source, target = (Studio(rig, SMALL) for rig in toy_pair)
+    plain = find_teacher(source, target, PairsConfig(method="pictures"))
+    smile = torch.tensor([[0.0, 0, 0, 0, 0, 1, 1], [0.0, 0, 0, 0, 0, 1, 0.9]])  # two that lie close
+    wanted = torch.tensor([[0.0, 0, 0, 0.3, 0, 0.5, 1], [0.0, 0, 0, 0.4, 0, 0.5, 1]])
+    taught = find_teacher(source, target, PairsConfig(method="pictures"), corrected=(smile, wanted))
+    torch.testing.assert_close(taught.weights(smile), wanted, rtol=0, atol=1e-3)
+    blink = torch.tensor([[1.0, 1, 0, 0, 0, 0, 0], [0.0, 0, 0, 0, 0, 0, 0]])
+    torch.testing.assert_close(taught.weights(blink), plain.weights(blink), rtol=0, atol=0.01)
+    half = torch.tensor([[0.0, 0, 0, 0, 0, 0.9, 0.9]])
+    assert 0.1 < float(taught.weights(half)[0, 3]) < 0.5
+    assert float(taught.confidence(smile).min()) > 0.99
+
+
+def test_a_face_at_rest_can_be_corrected(toy_pair):
+    source, target = (Studio(rig, SMALL) for rig in toy_pair)
+    wanted = torch.tensor([[0.0, 0, 0, 0.2, 0, 0, 0]])
+    taught = find_teacher(source, target, PairsConfig(method="pictures"), corrected=(torch.zeros(1, 7), wanted))
+    torch.testing.assert_close(taught.weights(torch.zeros(1, 7)), wanted, rtol=0, atol=1e-4)

@@ -20,6 +20,7 @@ from reenact.config import BPNetConfig, PairsConfig, load_config, save_config
 from reenact.errors import ReenactError
 from reenact.evaluation import vertex_error_ratio
 from reenact.inference import ImageRetargeter
+from reenact.nudges import Nudge, Nudges, save_nudges
 from reenact.pairs import Pairs, Teacher
 from reenact.rigs.clip import Clip
 from reenact.rigs.motion import expressions
@@ -198,7 +199,7 @@ def test_the_loss_through_the_renderer_is_left_out_where_no_picture_of_its_own_i
 
 
 def test_rigs_with_nothing_in_common_still_train(toy_config, tmp_path, monkeypatch):
-    nothing = Teacher(Pairs(torch.zeros(7, 7), torch.zeros(7), (), torch.ones(7)), None)
+    nothing = Teacher(Pairs(torch.zeros(7, 7), torch.zeros(7), (), torch.ones(7), torch.zeros(7, 7)), None)
     monkeypatch.setattr(Run, "teacher", lambda *_: nothing)
     train(replace(toy_config, run=str(tmp_path / "run")))
     assert all(torch.isfinite(value).all() for value in _weights(tmp_path / "run").values())
@@ -235,6 +236,52 @@ def test_what_is_learnt_moves_the_other_rig_without_being_told_how(pairs, toy_co
     weights = expressions(retargeter.source.names, 64, 12345)
     moved = retargeter(Clip(retargeter.source.names, weights, 30.0)).weights
     assert vertex_error_ratio(retargeter.target, moved, weights) < 0.25  # 1 is a face that stays still
+
+
+def test_networks_learn_what_a_person_corrected(toy_config, tmp_path):
+    """The label is one of this rig's shape at a frame where the source shows another."""
+    settings = replace(toy_config.training, steps=400, batch_size=32, frames=512, refresh=0, save_every=1000)
+    plain = replace(toy_config, training=settings)
+    runs = {"plain": train(replace(plain, run=str(tmp_path / "plain")))}
+    rigs = Run.open(runs["plain"]).rigs
+    (source, performer), (target, _) = rigs.items()
+    jaw, brow = performer.names.index("jawOpen"), performer.names.index("browInnerUp")
+    shown, wanted = torch.zeros(1, 7), torch.zeros(1, 7)
+    shown[0, jaw], wanted[0, jaw], wanted[0, brow] = 1.0, 1.0, 0.8
+    nudge = Nudge(
+        "clip",
+        30.0,
+        3,
+        8,
+        source,
+        target,
+        "networks",
+        {"browInnerUp": 0.8},
+        (*wanted[0].tolist(),),
+        (*shown[0].tolist(),),
+    )
+    save_nudges(Nudges({key: rig.names for key, rig in rigs.items()}, (nudge,)), tmp_path / "nudges.json")
+    taught = replace(plain, pairs=replace(plain.pairs, nudges=str(tmp_path / "nudges.json")))
+    runs["taught"] = train(replace(taught, run=str(tmp_path / "taught")))
+    blink = torch.zeros(1, 7)
+    blink[0, performer.names.index("eyeBlinkLeft")] = 1.0
+    moved = {}
+    for name, folder in runs.items():
+        retargeter = ImageRetargeter.load(folder)
+        moved[name] = retargeter(Clip(performer.names, torch.cat([shown, blink]), 30.0)).weights
+    assert moved["plain"][0, brow] < 0.2 < 0.5 < moved["taught"][0, brow]
+    assert moved["taught"][1, brow] < 0.2
+    (tmp_path / "nudges.json").unlink()
+    assert Run.open(runs["taught"]).config.pairs.nudges  # the run has a copy of its own
+    train(replace(taught, run=str(tmp_path / "taught")), resume=True)
+
+
+def test_nudges_of_other_rigs_are_refused(toy_config, tmp_path):
+    save_nudges(Nudges({"cat": ("meow",)}), tmp_path / "nudges.json")
+    strange = replace(toy_config.pairs, nudges=str(tmp_path / "nudges.json"))
+    with pytest.raises(ReenactError, match=r"nudges.json: expected corrected frames of ball or egg .*, got 0 of cat"):
+        train(replace(toy_config, run=str(tmp_path / "run"), pairs=strange))
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_preview_that_fails_does_not_stop_the_training(toy_run, tmp_path):

@@ -22,11 +22,11 @@ import safetensors.numpy
 import torch
 
 from reenact.errors import ReenactError
+from reenact.nudges import FORMAT, Nudge, Nudges, corrected, labels, load_nudges, save_nudges
 from reenact.portrait import Portrait
 from reenact.rigs import motion
 from reenact.rigs.clip import Clip
 from reenact.rigs.files import load_rig, read_clip, save_rig
-from reenact.viewer.nudges import FORMAT, Nudge, Nudges, corrected, labels, load_nudges, save_nudges
 from reenact.viewer.server import Server
 from reenact.viewer.session import Session
 

@@ -12,6 +12,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import DeformationTransfer, densify
@@ -32,6 +34,8 @@ class Consensus:
         target: Rig,
         correspondence: Correspondence | None = None,
         training: Clip | None = None,
+        *,
+        likeness: Float[Tensor, "Ks Kt"] | None = None,
     ) -> None:
         """
         Args:
@@ -39,12 +43,13 @@ class Consensus:
             target: Explains it.
             correspondence: Pairs of places; a few hundred tell small shapes apart.
             training: Not used.
+            likeness: See `ShapeMatching`.
 
         Raises:
             ReenactError: There is no correspondence, or it belongs to other rigs.
         """
         self.source, self.target = source, target
-        self.matching = ShapeMatching(source, target, correspondence)
+        self.matching = ShapeMatching(source, target, correspondence, likeness=likeness)
         """Its `partners` are empty where the rigs are not built to one scheme."""
         self.methods: tuple[Retargeter, ...] = (self.matching,)
         if not self.matching.partners:

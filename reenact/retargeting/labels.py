@@ -11,6 +11,7 @@ from reenact.retargeting.correspondence import Correspondence, find_corresponden
 from reenact.retargeting.geometric_prior import bending
 from reenact.retargeting.rbf import carry_shapes
 from reenact.retargeting.retargeter import check_names
+from reenact.retargeting.shape_matching import Partners
 from reenact.rigs import motion
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
@@ -22,30 +23,35 @@ MARKERS = 300
 class Labels:
     """Weights of the target for expressions of the source, by `Consensus`, and the confidence in them."""
 
-    def __init__(self, source: Rig, target: Rig, correspondence: Correspondence | None = None) -> None:
+    def __init__(
+        self,
+        source: Rig,
+        target: Rig,
+        correspondence: Correspondence | None = None,
+        likeness: Float[Tensor, "Ks Kt"] | None = None,
+    ) -> None:
         """
         Args:
             source: Performs.
             target: Is to perform the same.
             correspondence: Pairs of places; `MARKERS` of them are found where None.
+            likeness: See `ShapeMatching`.
 
         Raises:
             ReenactError: No correspondence is found.
         """
         self.source, self.target = source, target
         pairs = find_correspondence(source, target, MARKERS) if correspondence is None else correspondence
-        self._method = Consensus(source, target, pairs)
+        self._method = Consensus(source, target, pairs, likeness=likeness)
         self._carried = carry_shapes(source, target, pairs, stiffness=0.1)
-        self._personal = self._carried.guess.clone()
-        for ours, theirs in self.partners:
-            self._personal[theirs] = self._carried.source_shapes[ours]
+        self._personal = self.partners.personal(self._carried.source_shapes, self._carried.guess)
         self._bending = bending(target).double()
         own = motion.expressions(target.names, 200, seed=0).double()
         self._often = self._bent(own).quantile(0.95).clamp_min(1e-300)
 
     @property
-    def partners(self) -> tuple[tuple[int, int], ...]:
-        """Source and target shapes that are one; none where the rigs are not built to one scheme."""
+    def partners(self) -> Partners:
+        """Shapes that mean each other; none where the rigs are not built to one scheme."""
         return self._method.matching.partners
 
     def weights(self, source_weights: Float[Tensor, "T Ks"]) -> Float[Tensor, "T Kt"]:

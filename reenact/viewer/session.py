@@ -23,6 +23,7 @@ from safetensors.numpy import save
 from torch import Tensor
 
 from reenact.errors import ReenactError
+from reenact.nudges import Nudges, load_nudges, parse_nudges, save_nudges
 from reenact.portrait import CAMERA_DISTANCE, HALF_HEIGHT, Portrait
 from reenact.retargeting import METHODS
 from reenact.rigs.clip import Clip
@@ -31,7 +32,6 @@ from reenact.rigs.matching import conform
 from reenact.rigs.rig import Rig
 from reenact.rigs.timeline import resampled
 from reenact.run import Run
-from reenact.viewer.nudges import Nudges, load_nudges, parse_nudges, save_nudges
 
 DEFAULT_CLIP = "synthetic:7:10"
 """Plays where no clip is given and no file holds one."""

@@ -1,4 +1,4 @@
-// Nudges: what the user corrected, spread over the frames around it, with undo. reenact/viewer/nudges.py does the same to
+// Nudges: what the user corrected, spread over the frames around it, with undo. reenact/nudges.py does the same to
 // whole clips and says what is kept.
 
 export class Nudges {
