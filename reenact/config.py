@@ -110,7 +110,7 @@ class BPNetConfig:
     channels: int = 24
     """Convolutional: channels after the first convolution."""
     hidden: int = 512
-    """Width of the hidden dense layers."""
+    """Width of the hidden dense layers; 0 reads by a straight map."""
     epochs: float | None = None
     """Passes over the `training.frames` pictures, where they are never refreshed; None counts in `steps`."""
     steps: int = 3000
@@ -156,6 +156,11 @@ class TrainingConfig:
     read_loss: float = 1.0
     """Together: factor of the error of the weights that BPNet reads from what ReenactNet draws of the other rig's
     picture. It reaches back into ReenactNet, which learns to draw what is read right."""
+    align_loss: float = 0.0
+    """Together: factor of the distance between the codes of both rigs' pictures, in mean and covariance."""
+    cycle_loss: float = 0.0
+    """Together: factor of the distance between a picture and what comes back of it when the other rig is drawn, read,
+    rendered, and drawn back; on the pictures and from the step that `bpnet.image_fraction` and `image_from` say."""
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
     """How the learning rate changes over the steps."""
     optimizer: Literal["adamw", "adam"] = "adamw"
@@ -356,7 +361,7 @@ _ALLOWED: dict[str, _Rule] = {
     "reenactnet.decoder_channels": _EIGHTS,
     "reenactnet.kernel": ("an odd number from 3 to 15", lambda value: 3 <= value <= 15 and value % 2 == 1),
     "bpnet.channels": _EIGHTS,
-    "bpnet.hidden": _ONE_OR_MORE,
+    "bpnet.hidden": ("a whole number of at least 0", lambda value: value >= 0),
     "bpnet.epochs": _POSITIVE,
     "bpnet.steps": _ONE_OR_MORE,
     "bpnet.batch_size": _ONE_OR_MORE,
@@ -373,6 +378,8 @@ _ALLOWED: dict[str, _Rule] = {
     "training.elastic": _FRACTION,
     "training.pair_loss": _NOT_NEGATIVE,
     "training.read_loss": _NOT_NEGATIVE,
+    "training.align_loss": _NOT_NEGATIVE,
+    "training.cycle_loss": _NOT_NEGATIVE,
     "training.crowded": _FRACTION,
     "training.frames": ("a whole number from 8 to 1,000,000", lambda value: 8 <= value <= 1_000_000),
     "training.refresh": ("a whole number of at least 0", lambda value: value >= 0),

@@ -18,6 +18,18 @@ def weight_distance(a: Float[Tensor, "B K"], b: Float[Tensor, "B K"]) -> Float[T
     return (a - b).abs().mean(1)
 
 
+def code_distance(a: Float[Tensor, "B D"], b: Float[Tensor, "C D"]) -> Float[Tensor, ""]:
+    """How differently two sets of codes are distributed, in units of their own spread: 0 for the same distribution.
+
+    Mean squared differences of the means and of the covariances. Source: CORAL, Sun & Saenko 2016,
+    doi:10.1007/978-3-319-49409-8_35, which has the covariances only.
+    """
+    spread = torch.cat([a, b]).std(0).detach().clamp_min(1e-6)
+    a, b = a / spread, b / spread
+    covariances = [(each - each.mean(0)).T @ (each - each.mean(0)) / max(len(each) - 1, 1) for each in (a, b)]
+    return (a.mean(0) - b.mean(0)).square().mean() + (covariances[0] - covariances[1]).square().mean()
+
+
 class VertexDistance:
     """Root mean square vertex error of predicted weights, relative to the rig's typical motion. Ours.
 

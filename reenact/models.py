@@ -284,7 +284,7 @@ class Perceptron(nn.Module):
 
 def component_bpnet(shape_count: int, components: int, config: BPNetConfig) -> nn.Module:
     """Reads blendshape weights from a mixture of components: (B, M) -> (B, K), unbounded. Ours."""
-    return Perceptron(components, config.hidden, shape_count)
+    return Perceptron(components, config.hidden, shape_count) if config.hidden else nn.Linear(components, shape_count)
 
 
 def convolutional_bpnet(shape_count: int, resolution: int, config: BPNetConfig) -> nn.Module:
@@ -296,14 +296,11 @@ def convolutional_bpnet(shape_count: int, resolution: int, config: BPNetConfig) 
     blocks: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
         blocks += [nn.Conv2d(size_in, size_out, 3, 2, 1), nn.GroupNorm(8, size_out), nn.SiLU()]
-    small = resolution // 16
-    return nn.Sequential(
-        *blocks,
-        nn.Flatten(),
-        nn.Linear(sizes[-1] * small * small, config.hidden),
-        nn.SiLU(),
-        nn.Linear(config.hidden, shape_count),
-    )
+    read = sizes[-1] * (resolution // 16) ** 2
+    if not config.hidden:
+        return nn.Sequential(*blocks, nn.Flatten(), nn.Linear(read, shape_count))
+    dense = [nn.Linear(read, config.hidden), nn.SiLU(), nn.Linear(config.hidden, shape_count)]
+    return nn.Sequential(*blocks, nn.Flatten(), *dense)
 
 
 class Networks(nn.Module):

@@ -10,6 +10,7 @@ run takes the same next step as an unbroken one.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import shlex
@@ -31,7 +32,7 @@ from reenact.checkpoint import RunLock, flatten_optimizer, load_checkpoint, rest
 from reenact.config import Config
 from reenact.data import Studio, jitter
 from reenact.errors import ReenactError
-from reenact.losses import VertexDistance, weight_distance
+from reenact.losses import VertexDistance, code_distance, weight_distance
 from reenact.models import Networks
 from reenact.pairs import Teacher
 from reenact.preview import save_preview
@@ -329,14 +330,16 @@ def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Genera
     rig's pictures, whose error reaches both. Without a teacher BPNet reads what is drawn of the rig itself.
     """
     training, bpnet, networks, losses = shop.config.training, shop.config.bpnet, shop.networks, {}
-    net = networks.reenactnet
+    net, codes = networks.reenactnet, []
 
     def add(name: str, value: Tensor) -> None:
         losses[name] = losses.get(name, 0) + value
 
     for key, pool in pools.items():
         rows = torch.randint(len(pool.weights), (training.batch_size,), generator=random)
-        features, described = net.encode(pool.seen[rows], key), pool.described[rows]
+        code, described = net.code(pool.seen[rows], key), pool.described[rows]
+        features = net.unfold(code)
+        codes.append(code)
         drawn = net.decoders[key](features)
         add(f"reconstruction.{key}", net.distances(key, drawn, described).mean())
         predicted = networks.bpnets[key](net.readable(described))
@@ -354,6 +357,12 @@ def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Genera
         if bpnet.image_loss and done >= bpnet.image_from:
             some = slice(max(1, round(bpnet.image_fraction * training.batch_size)))
             add(f"image.{key}", bpnet.image_loss * _image_loss(shop, key, predicted[some], described[some]))
+        if training.cycle_loss and done >= bpnet.image_from:
+            some = slice(max(1, round(bpnet.image_fraction * training.batch_size)))
+            add(f"cycle.{key}", training.cycle_loss * _cycle_loss(shop, key, features[some], described[some]))
+    if training.align_loss:
+        pairs = list(itertools.combinations(codes, 2))
+        add("align", training.align_loss * torch.stack([code_distance(*pair) for pair in pairs]).mean())
     return losses
 
 
@@ -368,6 +377,20 @@ def _image_loss(shop: _Workshop, key: str, predicted: Tensor, described: Tensor)
     again = shop.studios[key].show(shop.studios[key].photograph(predicted))
     net = shop.networks.reenactnet
     return net.distances(key, net.describe(key, again), described).mean()
+
+
+def _cycle_loss(shop: _Workshop, key: str, features: Tensor, described: Tensor) -> Tensor:
+    """How far what comes back by way of each other rig is from the pictures: drawn, read, rendered, drawn back. Ours.
+
+    The render between both halves lets only faces pass that the other rig can make.
+    """
+    networks, net, misses = shop.networks, shop.networks.reenactnet, []
+    for other in [each for each in shop.studios if each != key]:
+        weights = networks.bpnets[other](net.readable(net.decoders[other](features)))
+        rendered = shop.studios[other].show(shop.studios[other].photograph(weights))
+        back = net(net.readable(net.describe(other, rendered)), other, key)
+        misses.append(net.distances(key, back, described).mean())
+    return torch.stack(misses).mean()
 
 
 def _reenactnet_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Generator) -> dict[str, Tensor]:

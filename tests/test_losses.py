@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from reenact.losses import VertexDistance, weight_distance
+from reenact.losses import VertexDistance, code_distance, weight_distance
 
 
 def test_weight_distance_is_the_mean_over_entries():
@@ -26,3 +26,19 @@ def test_vertex_distance_has_a_gradient_where_shapes_are_alike():
     weights = torch.zeros(1, 7, requires_grad=True)
     VertexDistance(rig, torch.rand(4, 7))(weights, torch.eye(7)[:1]).backward()
     assert bool(torch.isfinite(weights.grad).all())
+
+
+def test_codes_of_one_distribution_are_close_and_the_unit_does_not_matter():
+    random = torch.Generator().manual_seed(0)
+    a, b = torch.randn(4000, 5, generator=random), torch.randn(4000, 5, generator=random)
+    near = code_distance(a, b)
+    assert near < 0.01
+    torch.testing.assert_close(code_distance(100 * a, 100 * b), near)
+    assert code_distance(a, b + 1) > 0.5
+    mixed = b @ torch.tensor(
+        [[1.0, 0.9, 0, 0, 0], [0, 0.45, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 1]]
+    )
+    assert code_distance(a, mixed) > 0.03  # equal means, correlated
+    a.requires_grad_()
+    code_distance(a, b + 1).backward()
+    assert (a.grad.mean(0) < 0).all()  # drawn towards the other

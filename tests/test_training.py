@@ -181,6 +181,22 @@ def test_every_kind_of_network_trains_with_every_teacher_and_without(network, pa
         assert {"weights", "vertices", "image"} <= stages["bpnet.egg"].keys()
 
 
+@pytest.mark.parametrize("network", ["components", "convolutional"])
+def test_losses_between_the_rigs_train_where_asked(network, toy_config, tmp_path):
+    config = replace(
+        toy_config,
+        run=str(tmp_path / "run"),
+        reenactnet=replace(toy_config.reenactnet, network=network, encoder_channels=8, seed_channels=8),
+        bpnet=replace(toy_config.bpnet, channels=8, hidden=0),
+        training=replace(toy_config.training, align_loss=0.1, cycle_loss=0.5),
+    )
+    train(config)
+    terms = _losses(tmp_path / "run")[-1]
+    assert {"align", "cycle.ball", "cycle.egg"} <= terms.keys()
+    assert terms["align"] > 0
+    assert terms["cycle.ball"] > 0
+
+
 def test_errors_of_reading_reach_what_draws_only_where_asked(toy_config, tmp_path):
     """Without any other loss on it, a decoder moves by what is read from its drawings, or not at all."""
     moved = {}
