@@ -16,7 +16,8 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from tyro.extras import subcommand_cli_from_dict
 
 from reenact.config import Config, PostConfig, changed_settings, check_config, load_config
-from reenact.errors import ReenactError
+from reenact.errors import MissingError, ReenactError
+from reenact.folder import load_run_config
 
 # PyTorch's threads wait for work by spinning, and would take the cores from the renderer's threads, which run between
 # its operations. OpenMP reads this once, when PyTorch loads it.
@@ -57,7 +58,7 @@ def train(
     if resume:
         if settings.run is None:
             raise ReenactError("--resume: expected the folder of a run beside it, got none; add --run DIR")
-        saved = load_config(_run_config(settings.run))
+        saved = load_run_config(settings.run)
         changed = changed_settings(saved, replace(settings, run=saved.run))
         if changed:
             raise ReenactError(
@@ -446,7 +447,7 @@ def _train_defaults(arguments: list[str]) -> Config:
     if config is not None:
         return load_config(config)
     if run is not None and "--resume" in arguments:
-        return replace(load_config(_run_config(run)), run=run)
+        return load_run_config(run)
     return Config()
 
 
@@ -577,7 +578,7 @@ def _infer_defaults(arguments: list[str]) -> PostConfig:
     if arguments[:1] != ["infer"]:
         return PostConfig()
     runs = [argument for argument in arguments[1:] if (Path(argument) / "config.toml").is_file()]
-    return load_config(Path(runs[0]) / "config.toml").post if runs else PostConfig()
+    return load_run_config(runs[0]).post if runs else PostConfig()
 
 
 def _option(arguments: list[str], name: str) -> str | None:
@@ -593,9 +594,7 @@ def _option(arguments: list[str], name: str) -> str | None:
 def _run_config(run: Path | str) -> Path:
     path = Path(run) / "config.toml"
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{run}: expected a run folder with config.toml in it, got none; `reenact train` makes one"
-        )
+        raise MissingError(f"{run}: expected a run folder with config.toml in it, got none; `reenact train` makes one")
     return path
 
 
@@ -699,7 +698,7 @@ def _check_out(path: Path, suffixes: tuple[str, ...]) -> None:
     if path.is_dir():
         raise ReenactError(f"{path}: expected a file to write, got a folder; name a file in it")
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; make it first")
+        raise MissingError(f"{path}: the folder {path.parent} does not exist; make it first")
 
 
 def _tables(numbers: dict[str, Any]) -> list[Table]:

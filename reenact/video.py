@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from reenact.atomic import replacing
-from reenact.errors import ReenactError
+from reenact.errors import MissingError, ReenactError
 from reenact.portrait import BACKGROUND, Portrait
 from reenact.rigs.clip import Clip
 from reenact.rigs.files import load_clip, load_rig
@@ -159,7 +159,7 @@ def check_out(out: Path, audio: Path | None = None) -> None:
     if suffix not in SUFFIXES:
         raise ReenactError(f"{out}: expected .mp4, .gif, or a folder for pictures, got {suffix}")
     if not out.absolute().parent.is_dir():
-        raise FileNotFoundError(f"{out}: the folder {out.parent} does not exist; make it first")
+        raise MissingError(f"{out}: the folder {out.parent} does not exist; make it first")
     if suffix and out.is_dir():
         raise ReenactError(f"{out}: expected a file to write, got a folder; name a file in it")
     if not suffix and out.exists() and (not out.is_dir() or any(out.iterdir())):
