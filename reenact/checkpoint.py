@@ -475,9 +475,14 @@ def _alive(holder: dict[str, Any]) -> bool:
         return False
     if holder.get("host") != socket.gethostname():
         return True  # nobody here can tell
+    return alive(holder["pid"])
+
+
+def alive(process: int) -> bool:
+    """Whether there is such a process on this machine."""
     try:
-        os.kill(holder["pid"], 0)  # signal 0 only asks
-    except ProcessLookupError:
+        os.kill(process, 0)  # signal 0 only asks
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:  # alive, and somebody else's
         return True

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -403,7 +406,7 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit status: 0 for success, 2 for the user's mistake, 130 for Ctrl-C.
 
-    Anything else that goes wrong is our mistake, and escapes with its traceback.
+    Anything else that goes wrong is our mistake: status 1, its traceback, and how to report it.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     console = Console(stderr=True, emoji=False)  # a message may hold ":x:"
@@ -429,14 +432,42 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 2
         except OSError as error:  # a file that is missing or forbidden, a full disk
             where = f"{error.filename}: " if error.filename else ""
-            _say(console, "red", "error", f"{where}{error.strerror}" if error.strerror else str(error))
+            remedy = _REMEDIES.get(error.errno or 0, "")
+            _say(console, "red", "error", f"{where}{error.strerror}{remedy}" if error.strerror else str(error))
             return 2
+        except MemoryError:
+            words = (
+                "expected more memory than there is; take fewer vertices, shapes or training.frames, or smaller images"
+            )
+            _say(console, "red", "error", f"{' '.join(arguments[:1])}: {words}")
+            return 2
+        except Exception:
+            traceback.print_exc()
+            _say(console, "red", "our mistake", _PLEA)
+            return 1
     return 0
 
 
+_REMEDIES = {
+    errno.ENOSPC: "; free some space there (what was saved before is intact, and a training goes on with --resume)",
+    errno.EDQUOT: "; free some space there (what was saved before is intact, and a training goes on with --resume)",
+    errno.EACCES: "; name a place where you may read and write",
+    errno.EPERM: "; name a place where you may read and write",
+    errno.EROFS: "; name a place on a disk that can be written",
+    errno.EIO: "; the disk or the network failed: what was saved before is intact, try again or elsewhere",
+}
+"""What to do, by number of the system's error."""
+
+_PLEA = (
+    "this is a fault in Reenact, not in what you gave it; please report it with the lines above, the command, and what "
+    "`reenact doctor` prints. Nothing that was saved is lost"
+)
+
+
 def _say(console: Console, color: str, kind: str, message: str) -> None:
-    console.print(f"[{color}]{kind}:[/{color}]", end=" ", highlight=False)
-    console.print(message, markup=False, highlight=False, soft_wrap=True)  # a name may look like markup
+    with suppress(OSError):  # nobody is there any more
+        console.print(f"[{color}]{kind}:[/{color}]", end=" ", highlight=False)
+        console.print(message, markup=False, highlight=False, soft_wrap=True)  # a name may look like markup
 
 
 def _train_defaults(arguments: list[str]) -> Config:

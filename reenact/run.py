@@ -15,8 +15,12 @@ previews/            pictures drawn at each save
 from __future__ import annotations
 
 import errno
+import glob
 import itertools
+import os
 import re
+import shutil
+import socket
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +28,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from reenact.checkpoint import load_checkpoint, load_tensors, save_tensors
+from reenact.checkpoint import alive, load_checkpoint, load_tensors, save_tensors
 from reenact.config import Config, save_config
 from reenact.data import Studio
 from reenact.errors import ReenactError
@@ -71,7 +75,10 @@ class Run:
             OSError: The folder cannot be made.
         """
         if config.run:  # before the work, whose result it should hold
-            _check_new(Path(config.run))
+            folder = Path(config.run)
+            if folder.is_dir():
+                _sweep(folder, folder.resolve().name)
+            _check_new(folder)
         rigs = [
             load_rig(config.source, Choice(config.source_parts, config.source_shapes)),
             load_rig(config.target, Choice(config.target_parts, config.target_shapes)),
@@ -85,7 +92,8 @@ class Run:
         place.parent.mkdir(parents=True, exist_ok=True)
         # An empty folder is filled, not replaced: it may be a link, a mounted disk, or where the user stands.
         beside = place if place.exists() else place.parent
-        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=beside) as unfinished:
+        _sweep(beside, place.name)
+        with tempfile.TemporaryDirectory(prefix=f"{_mark(place.name)}{os.getpid()}-", dir=beside) as unfinished:
             whole = Path(unfinished) / "run"
             (whole / "rigs").mkdir(parents=True)
             for index, (key, rig, clip) in enumerate(zip(keyed, rigs, clips)):
@@ -314,6 +322,20 @@ def _keys(rigs: list[Rig]) -> list[str]:
     return keys
 
 
+def _mark(name: str) -> str:
+    """How the hidden folders begin in which this machine makes a run of that name; the process follows."""
+    machine = re.sub(r"[^A-Za-z0-9]+", "", socket.gethostname())[:30]
+    return f".{name[:50]}-{machine}-"
+
+
+def _sweep(place: Path, name: str) -> None:
+    """Remove what processes that were killed left of a run of that name."""
+    for leftover in place.glob(f"{glob.escape(_mark(name))}*"):
+        found = re.fullmatch(r"(\d+)-[^-]+", leftover.name[len(_mark(name)) :])
+        if found is not None and not alive(int(found[1])):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
 def _check_new(folder: Path, apart_from: str = "") -> None:
     """Refuse a folder that holds something, or where nothing can be written."""
     if folder.exists() and (not folder.is_dir() or any(each.name != apart_from for each in folder.iterdir())):
@@ -321,7 +343,12 @@ def _check_new(folder: Path, apart_from: str = "") -> None:
             f"{folder}: already holds something and a run never overwrites; add --resume to go on with it, "
             "or name another folder with --run"
         )
-    place = folder.resolve()
+    try:
+        place = folder.resolve()
+    except RuntimeError as error:  # Python before 3.13
+        raise ReenactError(
+            f"{folder}: expected a place for a folder, got links that lead in a circle; {error}"
+        ) from error
     with tempfile.TemporaryFile(dir=next(each for each in (place, *place.parents) if each.exists())):
         pass
 

@@ -243,7 +243,10 @@ def _save_mp4(
         finally:
             writer.close()
         # ffmpeg reports a full disk only in its log: count what is there before it gets its name.
-        there = imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+        try:
+            there = imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+        except RuntimeError:  # it cannot even read it
+            there = 0
         if there < count and audio is None:
             raise OSError(f"{out}: expected {count} frames, ffmpeg wrote {there}; is the disk full?")
 
