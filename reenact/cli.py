@@ -436,9 +436,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _say(console, "red", "error", f"{where}{error.strerror}{remedy}" if error.strerror else str(error))
             return 2
         except MemoryError:
-            words = (
-                "expected more memory than there is; take fewer vertices, shapes or training.frames, or smaller images"
-            )
+            words = "expected more memory than there is; take fewer vertices, shapes or frames, or smaller images"
             _say(console, "red", "error", f"{' '.join(arguments[:1])}: {words}")
             return 2
         except Exception:

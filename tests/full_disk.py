@@ -1,4 +1,4 @@
-"""Commands on a full disk: `unshare --user --map-root-user --mount python full_disk.py FOLDER`, which may mount small ones.
+"""Commands on a full disk: `unshare --user --map-root-user --mount python full_disk.py FOLDER`, to mount small ones.
 
 Prints as JSON what was tried and what went wrong.
 """
