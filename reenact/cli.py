@@ -1,4 +1,4 @@
-"""The commands: reenact train | infer | evaluate | view | render | convert | inspect | rigs."""
+"""The commands: reenact train | infer | evaluate | view | render | convert | inspect | rigs | doctor."""
 
 from __future__ import annotations
 
@@ -391,6 +391,38 @@ def rigs(
     console.print(f"\nContact sheet: {out}", highlight=False, soft_wrap=True)
 
 
+def doctor(*, json: Annotated[bool, FlagCreatePairsOff] = False) -> int:
+    """Check the installation, and say what to do where something is missing or wrong.
+
+    Versions, threads, the compiler, the renderer against a stored picture, the GPU, the disk here, the cache, optional
+    extras. The exit status is 1 when something is wrong that is needed.
+
+    Args:
+        json: Print the findings as JSON.
+    """
+    from dataclasses import asdict
+    from json import dumps
+
+    from reenact.doctor import examine, healthy
+
+    console = Console(markup=False, emoji=False, highlight=False)
+    with Console(stderr=True).status("Looking; the first time the renderer is compiled, which takes a minute"):
+        findings = examine(Path.cwd())
+    if json:
+        print(dumps([asdict(finding) for finding in findings], indent=1, ensure_ascii=False))
+        return 0 if healthy(findings) else 1
+    width = max(len(finding.name) for finding in findings)
+    for finding in findings:
+        color = {"ok": "green", "missing": "yellow" if not finding.needed else "red", "wrong": "red"}[finding.state]
+        console.print(f"{finding.state:<7}", style=color, end="  ")
+        console.print(f"{finding.name:<{width}}  {finding.found}", soft_wrap=True)
+        if finding.remedy:
+            console.print(f"{'':<{width + 11}}{finding.remedy}", soft_wrap=True)
+    said = "All that is needed is there" if healthy(findings) else "Something that is needed is missing or wrong"
+    console.print(f"\n{said}")
+    return 0 if healthy(findings) else 1
+
+
 COMMANDS = {
     "train": train,
     "infer": infer,
@@ -400,6 +432,7 @@ COMMANDS = {
     "convert": convert,
     "inspect": inspect,
     "rigs": rigs,
+    "doctor": doctor,
 }
 
 
@@ -418,7 +451,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "train": partial(train, settings=_train_defaults(arguments)),
                 "infer": partial(infer, post=_infer_defaults(arguments)),
             }
-            subcommand_cli_from_dict(
+            status = subcommand_cli_from_dict(
                 commands,
                 prog="reenact",
                 description="Any two blendshape rigs and a clip for the first: returns the clip on the second.",
@@ -443,7 +476,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exc()
             _say(console, "red", "our mistake", _PLEA)
             return 1
-    return 0
+    return status or 0
 
 
 _REMEDIES = {

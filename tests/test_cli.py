@@ -80,6 +80,7 @@ def test_help_names_every_command(capsys):
         ("convert", ["IN", "OUT", "--rig RIG", "--parts NAME", "--fps", "--post.smooth FLOAT"]),
         ("inspect", ["--out FILE.png", "--json FILE.json", "--parts NAME", "looks wrong"]),
         ("rigs", ["--out FILE.png", "--size INT"]),
+        ("doctor", ["--json", "what to do where something is missing or wrong"]),
     ],
 )
 def test_help_of_each_command_is_complete(command, words, capsys):
