@@ -68,7 +68,7 @@ def test_packages_that_are_missing_or_too_old_are_named_with_what_to_do(quick, t
 
 def test_code_that_is_not_installed_works_but_cannot_be_checked(quick, tmp_path, monkeypatch):
     def missing(_):
-        raise module.importlib.metadata.PackageNotFoundError
+        raise module.importlib.metadata.PackageNotFoundError("reenact")
 
     monkeypatch.setattr(module.importlib.metadata, "requires", missing)
     found = finding(tmp_path, "packages")

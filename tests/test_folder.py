@@ -137,7 +137,7 @@ def test_a_migration_that_is_cut_short_is_done_again(tmp_path, monkeypatch):
 
 def test_code_that_is_not_installed_has_no_version(monkeypatch):
     def missing(_):
-        raise module.importlib.metadata.PackageNotFoundError
+        raise module.importlib.metadata.PackageNotFoundError("reenact")
 
     monkeypatch.setattr(module.importlib.metadata, "version", missing)
     assert module.reenact_version() == "unknown"
