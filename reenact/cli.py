@@ -1,11 +1,14 @@
-"""The commands: reenact train | infer | evaluate | view | render | convert | inspect | rigs."""
+"""The commands: reenact train | infer | evaluate | view | render | convert | inspect | rigs | doctor."""
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
+import traceback
 import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +19,8 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from tyro.extras import subcommand_cli_from_dict
 
 from reenact.config import Config, PostConfig, changed_settings, check_config, load_config
-from reenact.errors import ReenactError
+from reenact.errors import MissingError, ReenactError
+from reenact.folder import load_run_config
 
 # PyTorch's threads wait for work by spinning, and would take the cores from the renderer's threads, which run between
 # its operations. OpenMP reads this once, when PyTorch loads it.
@@ -57,7 +61,7 @@ def train(
     if resume:
         if settings.run is None:
             raise ReenactError("--resume: expected the folder of a run beside it, got none; add --run DIR")
-        saved = load_config(_run_config(settings.run))
+        saved = load_run_config(settings.run)
         changed = changed_settings(saved, replace(settings, run=saved.run))
         if changed:
             raise ReenactError(
@@ -387,6 +391,38 @@ def rigs(
     console.print(f"\nContact sheet: {out}", highlight=False, soft_wrap=True)
 
 
+def doctor(*, json: Annotated[bool, FlagCreatePairsOff] = False) -> int:
+    """Check the installation, and say what to do where something is missing or wrong.
+
+    Versions, threads, the compiler, the renderer against a stored picture, the GPU, the disk here, the cache, optional
+    extras. The exit status is 1 when something is wrong that is needed.
+
+    Args:
+        json: Print the findings as JSON.
+    """
+    from dataclasses import asdict
+    from json import dumps
+
+    from reenact.doctor import examine, healthy
+
+    console = Console(markup=False, emoji=False, highlight=False)
+    with Console(stderr=True).status("Looking; the first time the renderer is compiled, which takes a minute"):
+        findings = examine(Path.cwd())
+    if json:
+        print(dumps([asdict(finding) for finding in findings], indent=1, ensure_ascii=False))
+        return 0 if healthy(findings) else 1
+    width = max(len(finding.name) for finding in findings)
+    for finding in findings:
+        color = {"ok": "green", "missing": "yellow" if not finding.needed else "red", "wrong": "red"}[finding.state]
+        console.print(f"{finding.state:<7}", style=color, end="  ")
+        console.print(f"{finding.name:<{width}}  {finding.found}", soft_wrap=True)
+        if finding.remedy:
+            console.print(f"{'':<{width + 11}}{finding.remedy}", soft_wrap=True)
+    said = "All that is needed is there" if healthy(findings) else "Something that is needed is missing or wrong"
+    console.print(f"\n{said}")
+    return 0 if healthy(findings) else 1
+
+
 COMMANDS = {
     "train": train,
     "infer": infer,
@@ -396,13 +432,14 @@ COMMANDS = {
     "convert": convert,
     "inspect": inspect,
     "rigs": rigs,
+    "doctor": doctor,
 }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit status: 0 for success, 2 for the user's mistake, 130 for Ctrl-C.
 
-    Anything else that goes wrong is our mistake, and escapes with its traceback.
+    Anything else that goes wrong is our mistake: status 1, its traceback, and how to report it.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     console = Console(stderr=True, emoji=False)  # a message may hold ":x:"
@@ -414,7 +451,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "train": partial(train, settings=_train_defaults(arguments)),
                 "infer": partial(infer, post=_infer_defaults(arguments)),
             }
-            subcommand_cli_from_dict(
+            status = subcommand_cli_from_dict(
                 commands,
                 prog="reenact",
                 description="Any two blendshape rigs and a clip for the first: returns the clip on the second.",
@@ -428,14 +465,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 2
         except OSError as error:  # a file that is missing or forbidden, a full disk
             where = f"{error.filename}: " if error.filename else ""
-            _say(console, "red", "error", f"{where}{error.strerror}" if error.strerror else str(error))
+            remedy = _REMEDIES.get(error.errno or 0, "")
+            _say(console, "red", "error", f"{where}{error.strerror}{remedy}" if error.strerror else str(error))
             return 2
-    return 0
+        except MemoryError:
+            words = "expected more memory than there is; take fewer vertices, shapes or frames, or smaller images"
+            _say(console, "red", "error", f"{' '.join(arguments[:1])}: {words}")
+            return 2
+        except Exception:
+            traceback.print_exc()
+            _say(console, "red", "our mistake", _PLEA)
+            return 1
+    return status or 0
+
+
+_REMEDIES = {
+    errno.ENOSPC: "; free some space there (what was saved before is intact, and a training goes on with --resume)",
+    errno.EDQUOT: "; free some space there (what was saved before is intact, and a training goes on with --resume)",
+    errno.EACCES: "; name a place where you may read and write",
+    errno.EPERM: "; name a place where you may read and write",
+    errno.EROFS: "; name a place on a disk that can be written",
+    errno.EIO: "; the disk or the network failed: what was saved before is intact, try again or elsewhere",
+}
+"""What to do, by number of the system's error."""
+
+_PLEA = (
+    "this is a fault in Reenact, not in what you gave it; please report it with the lines above, the command, and what "
+    "`reenact doctor` prints. Nothing that was saved is lost"
+)
 
 
 def _say(console: Console, color: str, kind: str, message: str) -> None:
-    console.print(f"[{color}]{kind}:[/{color}]", end=" ", highlight=False)
-    console.print(message, markup=False, highlight=False, soft_wrap=True)  # a name may look like markup
+    with suppress(OSError):  # nobody is there any more
+        console.print(f"[{color}]{kind}:[/{color}]", end=" ", highlight=False)
+        console.print(message, markup=False, highlight=False, soft_wrap=True)  # a name may look like markup
 
 
 def _train_defaults(arguments: list[str]) -> Config:
@@ -446,7 +509,7 @@ def _train_defaults(arguments: list[str]) -> Config:
     if config is not None:
         return load_config(config)
     if run is not None and "--resume" in arguments:
-        return replace(load_config(_run_config(run)), run=run)
+        return load_run_config(run)
     return Config()
 
 
@@ -577,7 +640,7 @@ def _infer_defaults(arguments: list[str]) -> PostConfig:
     if arguments[:1] != ["infer"]:
         return PostConfig()
     runs = [argument for argument in arguments[1:] if (Path(argument) / "config.toml").is_file()]
-    return load_config(Path(runs[0]) / "config.toml").post if runs else PostConfig()
+    return load_run_config(runs[0]).post if runs else PostConfig()
 
 
 def _option(arguments: list[str], name: str) -> str | None:
@@ -593,9 +656,7 @@ def _option(arguments: list[str], name: str) -> str | None:
 def _run_config(run: Path | str) -> Path:
     path = Path(run) / "config.toml"
     if not path.is_file():
-        raise FileNotFoundError(
-            f"{run}: expected a run folder with config.toml in it, got none; `reenact train` makes one"
-        )
+        raise MissingError(f"{run}: expected a run folder with config.toml in it, got none; `reenact train` makes one")
     return path
 
 
@@ -699,7 +760,7 @@ def _check_out(path: Path, suffixes: tuple[str, ...]) -> None:
     if path.is_dir():
         raise ReenactError(f"{path}: expected a file to write, got a folder; name a file in it")
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; make it first")
+        raise MissingError(f"{path}: the folder {path.parent} does not exist; make it first")
 
 
 def _tables(numbers: dict[str, Any]) -> list[Table]:

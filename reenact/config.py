@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from reenact.atomic import write_atomically
-from reenact.errors import ReenactError
+from reenact.errors import MissingError, ReenactError
 
 
 @dataclass(frozen=True)
@@ -247,21 +247,30 @@ def load_config(path: Path | str) -> Config:
     """The settings in a TOML file; keys that it leaves out have their defaults.
 
     Raises:
-        FileNotFoundError: There is no such file.
+        MissingError: There is no such file.
         ReenactError: Not TOML, an unknown key, a value of the wrong type or out of range.
+    """
+    config = config_from_dict(read_table(path), origin=str(path))
+    check_config(config, origin=str(path))
+    return config
+
+
+def read_table(path: Path | str) -> dict[str, Any]:
+    """What a TOML file says, unchecked.
+
+    Raises:
+        MissingError: There is no such file.
+        ReenactError: It is not TOML.
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: there is no such settings file; see configs/ for examples")
+        raise MissingError(f"{path}: there is no such settings file; see configs/ for examples")
     try:
-        table = tomllib.loads(path.read_bytes().decode())
+        return tomllib.loads(path.read_bytes().decode())
     except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, numbers of thousands of digits
         raise ReenactError(
             f"{path}: expected TOML, got something else ({error}); compare with the files in configs/"
         ) from error
-    config = config_from_dict(table, origin=str(path))
-    check_config(config, origin=str(path))
-    return config
 
 
 def save_config(config: Config, path: Path | str) -> None:

@@ -1,6 +1,7 @@
 """Run: the folder of one training, with everything that is needed to repeat, resume or use it.
 
 config.toml          every setting, resolved
+format.json          which layout the folder has; see `reenact.folder`
 rigs/0-man.npz ...   the rigs as they were; the first is the source, whose layout all others share
 clips/0-man.npz ...  training motion of the rigs that were given some
 layouts.safetensors  sampling grid of each other rig
@@ -13,8 +14,13 @@ previews/            pictures drawn at each save
 
 from __future__ import annotations
 
+import errno
+import glob
 import itertools
+import os
 import re
+import shutil
+import socket
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,10 +28,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from reenact.checkpoint import load_checkpoint, load_tensors, save_tensors
-from reenact.config import Config, load_config, save_config
+from reenact.checkpoint import alive, load_checkpoint, load_tensors, save_tensors
+from reenact.config import Config, save_config
 from reenact.data import Studio
 from reenact.errors import ReenactError
+from reenact.folder import load_run_config, write_format
 from reenact.layout import find_layout, lay_out
 from reenact.models import Networks
 from reenact.nudges import Nudges, labels, load_nudges, save_nudges
@@ -70,25 +77,26 @@ class Run:
             ReenactError: The folder already holds something, or a rig or clip cannot be read or photographed.
             OSError: The folder cannot be made.
         """
+        if config.run:  # before the work, whose result it should hold
+            folder = Path(config.run)
+            if folder.is_dir():
+                _sweep(folder, folder.resolve().name)
+            _check_new(folder)
         rigs = [
             load_rig(config.source, Choice(config.source_parts, config.source_shapes)),
             load_rig(config.target, Choice(config.target_parts, config.target_shapes)),
         ]
         folder = Path(config.run) if config.run else _new_folder(rigs)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise ReenactError(
-                f"{folder}: already holds something and a run never overwrites; add --resume to go on with it, "
-                "or name another folder with --run"
-            )
         keyed = dict(zip(_keys(rigs), rigs))
         clip_names = (config.source_clip, config.target_clip)
         clips = [None if name is None else load_clip(name, rig) for name, rig in zip(clip_names, rigs)]
-        config = replace(config, run=str(folder))
+        named, config = bool(config.run), replace(config, run=str(folder))
         place = folder.resolve()
         place.parent.mkdir(parents=True, exist_ok=True)
         # An empty folder is filled, not replaced: it may be a link, a mounted disk, or where the user stands.
         beside = place if place.exists() else place.parent
-        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=beside) as unfinished:
+        _sweep(beside, place.name)
+        with tempfile.TemporaryDirectory(prefix=f"{_mark(place.name)}{os.getpid()}-", dir=beside) as unfinished:
             whole = Path(unfinished) / "run"
             (whole / "rigs").mkdir(parents=True)
             for index, (key, rig, clip) in enumerate(zip(keyed, rigs, clips)):
@@ -104,13 +112,25 @@ class Run:
                 save_correspondence(correspondence, whole / "correspondences" / _pair_file(list(keyed), first, second))
             layouts = _find_layouts(keyed, correspondences, config)
             save_tensors(layouts, whole / "layouts.safetensors")
+            write_format(whole)
             save_config(config, whole / "config.toml")
             # A run appears whole or not at all: by one rename, or with its config, without which it is none, last.
             if beside is place:
+                _check_new(folder, apart_from=Path(unfinished).name)  # others may have come first
                 for part in sorted(whole.iterdir(), key=lambda part: part.name == "config.toml"):
                     part.replace(place / part.name)
             else:
-                whole.replace(place)
+                while True:
+                    try:
+                        whole.replace(place)
+                        break
+                    except OSError as error:
+                        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                            raise
+                    if named:
+                        _check_new(folder)
+                    folder = _new_folder(rigs)
+                    place = folder.resolve()
         return cls(folder, config, keyed, layouts, correspondences)
 
     @classmethod
@@ -118,13 +138,12 @@ class Run:
         """The run in a folder.
 
         Raises:
-            FileNotFoundError: There is no run.
-            ReenactError: Its settings, rigs or layouts are missing or damaged.
+            MissingError: There is no run.
+            ReenactError: It is of a format that this version does not open, or settings, rigs or layouts are missing or
+                damaged.
         """
         folder = Path(folder)
-        if not (folder / "config.toml").is_file():
-            raise FileNotFoundError(f"{folder}: expected a run folder with config.toml; train one with `reenact train`")
-        config = replace(load_config(folder / "config.toml"), run=str(folder))
+        config = load_run_config(folder)
         rigs = _load_rigs(folder / "rigs")
         layouts = _load_layouts(folder / "layouts.safetensors", config, list(rigs))
         return cls(folder, config, rigs, layouts, _load_correspondences(folder / "correspondences", config, rigs))
@@ -179,7 +198,7 @@ class Run:
         """The networks of the newest checkpoint, in evaluation mode.
 
         Raises:
-            FileNotFoundError: Nothing was saved yet.
+            MissingError: Nothing was saved yet.
             ReenactError: No checkpoint is whole, or they are of other networks.
         """
         networks = self.networks()
@@ -332,6 +351,37 @@ def _keys(rigs: list[Rig]) -> list[str]:
         free = (f"{key}-{number}" for number in itertools.count(2))
         keys.append(next(name for name in free if name not in keys) if key in keys else key)
     return keys
+
+
+def _mark(name: str) -> str:
+    """How the hidden folders begin in which this machine makes a run of that name; the process follows."""
+    machine = re.sub(r"[^A-Za-z0-9]+", "", socket.gethostname())[:30]
+    return f".{name[:50]}-{machine}-"
+
+
+def _sweep(place: Path, name: str) -> None:
+    """Remove what processes that were killed left of a run of that name."""
+    for leftover in place.glob(f"{glob.escape(_mark(name))}*"):
+        found = re.fullmatch(r"(\d+)-[^-]+", leftover.name[len(_mark(name)) :])
+        if found is not None and not alive(int(found[1])):
+            shutil.rmtree(leftover, ignore_errors=True)
+
+
+def _check_new(folder: Path, apart_from: str = "") -> None:
+    """Refuse a folder that holds something, or where nothing can be written."""
+    if folder.exists() and (not folder.is_dir() or any(each.name != apart_from for each in folder.iterdir())):
+        raise ReenactError(
+            f"{folder}: already holds something and a run never overwrites; add --resume to go on with it, "
+            "or name another folder with --run"
+        )
+    try:
+        place = folder.resolve()
+    except RuntimeError as error:  # Python before 3.13
+        raise ReenactError(
+            f"{folder}: expected a place for a folder, got links that lead in a circle; {error}"
+        ) from error
+    with tempfile.TemporaryFile(dir=next(each for each in (place, *place.parents) if each.exists())):
+        pass
 
 
 def _new_folder(rigs: list[Rig]) -> Path:

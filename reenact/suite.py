@@ -440,7 +440,7 @@ def code_version() -> str:
     for package in (reenact, render):
         root = Path(package.__file__).parent
         for path in sorted(root.rglob("*.py")):
-            if "viewer" in path.parts or path.stem in ("cli", "report", "preview", "inspection"):
+            if "viewer" in path.parts or path.stem in ("cli", "report", "preview", "inspection", "doctor"):
                 continue
             digest.update(path.relative_to(root).as_posix().encode())
             digest.update(ast.dump(_without_docstrings(ast.parse(path.read_bytes()))).encode())

@@ -10,11 +10,14 @@ run takes the same next step as an unbroken one.
 
 from __future__ import annotations
 
+import io
 import itertools
 import json
 import math
+import os
 import shlex
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,10 +31,18 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
 from reenact.atomic import write_atomically
-from reenact.checkpoint import RunLock, flatten_optimizer, load_checkpoint, restore_optimizer, save_checkpoint
+from reenact.checkpoint import (
+    RunLock,
+    flatten_optimizer,
+    load_checkpoint,
+    restore_optimizer,
+    save_checkpoint,
+    save_tensors,
+)
 from reenact.config import Config
 from reenact.data import Studio, jitter
 from reenact.errors import ReenactError
+from reenact.folder import migrate
 from reenact.losses import VertexDistance, code_distance, weight_distance
 from reenact.models import Networks
 from reenact.pairs import Teacher
@@ -61,8 +72,10 @@ class _Stage:
     learning_rate: float
     render: Callable[[list[int]], dict[str, _Pool]]
     """Fresh expressions of the rigs that take part; the numbers seed them."""
-    losses: Callable[[dict[str, _Pool], torch.Generator, float], dict[str, Tensor]]
-    """Terms whose sum is minimised, on a batch from the pools; the share of the steps that are done."""
+    draw: Callable[[dict[str, _Pool], torch.Generator], dict[str, Tensor]]
+    """Rows of the pools that make a batch."""
+    losses: Callable[[dict[str, _Pool], dict[str, Tensor], float], dict[str, Tensor]]
+    """Terms whose sum is minimised, on those rows; the share of the steps that are done."""
 
 
 @dataclass(frozen=True)
@@ -108,73 +121,91 @@ def train(config: Config, resume: bool = False) -> Path:
         The run folder.
 
     Raises:
-        FileNotFoundError: There is no run to resume.
+        MissingError: There is no run to resume.
         ReenactError: The folder holds something and `resume` is False, another process trains in it, a rig or clip
-            cannot work, the run is damaged or of another version, a loss is not finite.
+            cannot work, the run is damaged or of another version, a loss or a network is no longer finite.
         OSError: The folder cannot be written; the last checkpoint is intact.
         KeyboardInterrupt: Ctrl-C; everything up to the last finished step was saved.
-        SystemExit: SIGTERM, likewise saved; status 143.
+        SystemExit: SIGTERM or a lost terminal, likewise saved; status 143 or 129.
     """
-    console = Console(markup=False, highlight=False, emoji=False)  # a folder may look like markup
-    # Already for the layout, which sums of several threads would end in other bits from time to time.
-    torch.set_num_threads(config.training.threads or torch.get_num_threads())
-    with console.status("Reading rigs, finding the layout"):
-        run = Run.open(Path(config.run or "")) if resume else Run.create(config)
-    config = run.config
-    with RunLock(run.folder), _interrupts() as interrupted:
+    console = Console(file=_Output(), markup=False, highlight=False, emoji=False)  # a folder may look like markup
+    with _interrupts() as interrupts:
+        # Already for the layout, which sums of several threads would end in other bits from time to time.
         torch.set_num_threads(config.training.threads or torch.get_num_threads())
-        with console.status("Photographing neutrals"):
-            studios = {key: run.studio(key) for key in run.keys}
-        networks = run.networks()
-        with console.status("Comparing shapes"):
-            teachers = _find_teachers(run, studios, console)
-        distances = {key: VertexDistance(studio.rig, studio.typical) for key, studio in studios.items()}
-        stages = _stages(_Workshop(config, studios, networks, teachers, distances))
-        stage_index, first, optimizer = _restore(run, networks, stages) if resume else (0, 0, None)
-        if (stage_index, first) == (0, 0):
-            count = _PICTURES_PER_COMPONENT * config.reenactnet.components
-            with console.status("Finding what varies in each rig's pictures"):
-                networks.fit({key: studio.show(studio.survey(count)) for key, studio in studios.items()})
-        done = sum(stage.steps for stage in stages[:stage_index])
-        with _progress(console) as show:
-            for index, stage in list(enumerate(stages))[stage_index:]:
-                optimizer = optimizer or _optimizer(config, stage)
-                log, pools = _Log(run.folder / "metrics.jsonl", stage.name, first), None
-                networks.train()
-                for step in range(first, stage.steps):
-                    seed = [config.training.seed, index, step]
-                    chapter = step // (config.training.refresh or stage.steps)
-                    if pools is None or step == chapter * config.training.refresh:
-                        console.print(f"{stage.name}: rendering {config.training.frames:,} fresh expressions per rig")
-                        pools = stage.render([config.training.seed, index, chapter])
-                    for group in optimizer.param_groups:
-                        group["lr"] = learning_rate(step, stage.steps, stage.learning_rate, config.training.schedule)
-                    losses = stage.losses(pools, _torch_random(seed), step / stage.steps)
-                    loss = torch.stack(list(losses.values())).sum()
-                    if not torch.isfinite(loss):
-                        raise ReenactError(
-                            f"{run.folder}: the loss of {stage.name} became {loss.item()} at step {step}; "
-                            "the last checkpoint is intact, lower the learning rate and train again"
-                        )
-                    optimizer.zero_grad(set_to_none=True)
-                    loss.backward()
-                    optimizer.step()
-                    log.add(step, losses)
-                    show(stage.name, step + 1, stage.steps, log.recent)
-                    last = step + 1 == stage.steps
-                    if last or (step + 1) % config.training.save_every == 0 or interrupted():
-                        log.flush()
-                        _save(run, networks, optimizer, index, step + 1, done + step + 1)
-                        _preview(run, networks, studios, index, done + step + 1, console)
-                    if interrupted():
-                        console.print(
-                            f"Stopped and saved. Go on with: reenact train --run {_quoted(run)} --resume",
-                            soft_wrap=True,
-                        )
-                        raise interrupted()
-                done, first, optimizer = done + stage.steps, 0, None
+        with console.status("Reading rigs, finding the layout"):
+            run = Run.open(Path(config.run or "")) if resume else Run.create(config)
+        with RunLock(run.folder) as lock:
+            if resume:
+                migrate(run.folder, run.config)
+            _train(run, resume, lock, interrupts, console)
     _say_next(console, run)
     return run.folder
+
+
+def _train(run: Run, resume: bool, lock: RunLock, interrupts: _Interrupts, console: Console) -> None:
+    """The loop, for all stages that are left; interrupts end it at once until its first step, then after a save."""
+    config = run.config
+    torch.set_num_threads(config.training.threads or torch.get_num_threads())
+    with console.status("Photographing neutrals"):
+        studios = {key: run.studio(key) for key in run.keys}
+    networks = run.networks()
+    with console.status("Comparing shapes"):
+        teachers = _find_teachers(run, studios, console)
+    distances = {key: VertexDistance(studio.rig, studio.typical) for key, studio in studios.items()}
+    stages = _stages(_Workshop(config, studios, networks, teachers, distances))
+    stage_index, first, optimizer = _restore(run, networks, stages) if resume else (0, 0, None)
+    if (stage_index, first) == (0, 0):
+        count = _PICTURES_PER_COMPONENT * config.reenactnet.components
+        with console.status("Finding what varies in each rig's pictures"):
+            networks.fit({key: studio.show(studio.survey(count)) for key, studio in studios.items()})
+    done = sum(stage.steps for stage in stages[:stage_index])
+    with _progress(console) as show, interrupts.patiently():
+        for index, stage in list(enumerate(stages))[stage_index:]:
+            optimizer = optimizer or _optimizer(config, stage)
+            log, pools, saved = _Log(run.folder / "metrics.jsonl", stage.name, first), None, first
+            networks.train()
+            for step in range(first, stage.steps):
+                seed = [config.training.seed, index, step]
+                chapter = step // (config.training.refresh or stage.steps)
+                if pools is None or step == chapter * config.training.refresh:
+                    console.print(f"{stage.name}: rendering {config.training.frames:,} fresh expressions per rig")
+                    try:
+                        with interrupts.promptly():
+                            pools = stage.render([config.training.seed, index, chapter])
+                    except (KeyboardInterrupt, SystemExit):  # no step is half done: what was learnt is kept
+                        if step > saved:
+                            log.flush()
+                            _save(run, lock, networks, optimizer, index, step, done + step)
+                        _say_stopped(console, run)
+                        raise
+                for group in optimizer.param_groups:
+                    group["lr"] = learning_rate(step, stage.steps, stage.learning_rate, config.training.schedule)
+                rows = stage.draw(pools, _torch_random(seed))
+                losses = stage.losses(pools, rows, step / stage.steps)
+                loss = torch.stack(list(losses.values())).sum()
+                optimizer.zero_grad(set_to_none=True)
+                loss.backward()
+                wrong = _not_finite(loss, stage.network)
+                if wrong:
+                    kept = _keep_batch(run, pools, rows, losses, done + step)
+                    raise ReenactError(
+                        f"{run.folder}: {wrong} of {stage.name} became infinite or no number at step {step}; {kept}the "
+                        "last checkpoint is intact, lower the learning rate and train again"
+                    )
+                optimizer.step()
+                log.add(step, losses)
+                show(stage.name, step + 1, stage.steps, log.recent)
+                last = step + 1 == stage.steps
+                if last or (step + 1) % config.training.save_every == 0 or interrupts.asked:
+                    log.flush()
+                    _save(run, lock, networks, optimizer, index, step + 1, done + step + 1)
+                    saved = step + 1
+                    if not interrupts.asked:
+                        _preview(run, networks, studios, index, done + step + 1, console)
+                if interrupts.asked:
+                    _say_stopped(console, run)
+                    raise interrupts.asked
+            done, first, optimizer = done + stage.steps, 0, None
 
 
 def learning_rate(step: int, steps: int, peak: float, schedule: str) -> float:
@@ -249,7 +280,8 @@ def _stages(shop: _Workshop) -> list[_Stage]:
                 steps,
                 training.learning_rate,
                 render_all,
-                lambda pools, random, done: _joint_losses(shop, pools, random, done),
+                lambda pools, random: _draw(pools, training.batch_size, random),
+                lambda pools, rows, done: _joint_losses(shop, pools, rows, done),
             )
         ]
     stages = [
@@ -259,7 +291,8 @@ def _stages(shop: _Workshop) -> list[_Stage]:
             steps,
             training.learning_rate,
             render_all,
-            lambda pools, random, _done: _reenactnet_losses(shop, pools, random),
+            lambda pools, random: _draw(pools, training.batch_size, random),
+            lambda pools, rows, _done: _reenactnet_losses(shop, pools, rows),
         )
     ]
     for key in keys:
@@ -274,7 +307,8 @@ def _stages(shop: _Workshop) -> list[_Stage]:
                     key: _render(shop, key, seed, []),
                     **{other: _render(shop, other, seed, [key], pictured=False) for other in others},
                 },
-                lambda pools, random, done, key=key: _bpnet_losses(shop, key, pools, random, done),
+                lambda pools, random, key=key: _draw_for_bpnet(shop, key, pools, random),
+                lambda pools, rows, done, key=key: _bpnet_losses(shop, key, pools, rows, done),
             )
         )
     return stages
@@ -323,7 +357,25 @@ def _corrected_first(shop: _Workshop, key: str, weights: Tensor, seed: list[int]
     return torch.cat([torch.lerp(weights[: len(centres)], centres, share), weights[len(centres) :]])
 
 
-def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Generator, done: float) -> dict[str, Tensor]:
+def _draw(pools: dict[str, _Pool], count: int, random: torch.Generator) -> dict[str, Tensor]:
+    """As many rows of each pool."""
+    return {key: torch.randint(len(pool.weights), (count,), generator=random) for key, pool in pools.items()}
+
+
+def _draw_for_bpnet(shop: _Workshop, key: str, pools: dict[str, _Pool], random: torch.Generator) -> dict[str, Tensor]:
+    """Rows of the rig's own pool; and of the others', whose pictures take the place of the first, by confidence."""
+    bpnet = shop.config.bpnet
+    rows = {key: torch.randint(len(pools[key].weights), (bpnet.batch_size,), generator=random)}
+    sources = [other for other in pools if key in pools[other].partners]
+    count = round(bpnet.decoded_fraction * bpnet.batch_size)
+    for source, part in zip(sources, torch.arange(count).tensor_split(max(1, len(sources)))):
+        if len(part):
+            confidence = pools[source].partners[key].confidence
+            rows[source] = torch.multinomial(confidence, len(part), replacement=True, generator=random)
+    return rows
+
+
+def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], batch: dict[str, Tensor], done: float) -> dict[str, Tensor]:
     """Each rig redraws itself and is read back, and the other where a teacher tells how. Ours, after KI21.
 
     L_recon and L_b of KI21, with one more term: the weights that BPNet reads from what ReenactNet draws of the other
@@ -336,7 +388,7 @@ def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Genera
         losses[name] = losses.get(name, 0) + value
 
     for key, pool in pools.items():
-        rows = torch.randint(len(pool.weights), (training.batch_size,), generator=random)
+        rows = batch[key]
         code, described = net.code(pool.seen[rows], key), pool.described[rows]
         features = net.unfold(code)
         codes.append(code)
@@ -393,14 +445,14 @@ def _cycle_loss(shop: _Workshop, key: str, features: Tensor, described: Tensor) 
     return torch.stack(misses).mean()
 
 
-def _reenactnet_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.Generator) -> dict[str, Tensor]:
+def _reenactnet_losses(shop: _Workshop, pools: dict[str, _Pool], batch: dict[str, Tensor]) -> dict[str, Tensor]:
     """Each rig redraws itself through the shared encoder, and the other where pairs tell how. Source: KI21, L_recon.
 
     Ours: residuals against the neutral, jitter of the encoder's input only, pairs.
     """
     training, net, losses = shop.config.training, shop.networks.reenactnet, {}
     for key, pool in pools.items():
-        rows = torch.randint(len(pool.weights), (training.batch_size,), generator=random)
+        rows = batch[key]
         features = net.encode(pool.seen[rows], key)
         drawn = net.decoders[key](features)
         losses[f"reconstruction.{key}"] = net.distances(key, drawn, pool.described[rows]).mean()
@@ -412,7 +464,7 @@ def _reenactnet_losses(shop: _Workshop, pools: dict[str, _Pool], random: torch.G
 
 
 def _bpnet_losses(
-    shop: _Workshop, key: str, pools: dict[str, _Pool], random: torch.Generator, done: float
+    shop: _Workshop, key: str, pools: dict[str, _Pool], batch: dict[str, Tensor], done: float
 ) -> dict[str, Tensor]:
     """Weights are read back from pictures of the rig's own expressions. Source: KI21, L_b = L_w + L_r.
 
@@ -420,7 +472,7 @@ def _bpnet_losses(
     how far they move the vertices; L_r is taken on part of the pictures.
     """
     bpnet, net, own = shop.config.bpnet, shop.networks.reenactnet, pools[key]
-    rows = torch.randint(len(own.weights), (bpnet.batch_size,), generator=random)
+    rows = batch[key]
     weights, described = own.weights[rows], own.described[rows]
     read = net.readable(described)
     count = round(bpnet.decoded_fraction * bpnet.batch_size)
@@ -432,8 +484,7 @@ def _bpnet_losses(
             if source == key:
                 drawn = net(own.seen[rows[part]], key, key)
             else:
-                partners = pools[source].partners[key]
-                chosen = torch.multinomial(partners.confidence, len(part), replacement=True, generator=random)
+                partners, chosen = pools[source].partners[key], batch[source]
                 drawn = net(pools[source].seen[chosen], source, key)
                 weights = weights.index_copy(0, part, partners.weights[chosen])
             read = read.index_copy(0, part, net.readable(drawn))
@@ -469,11 +520,59 @@ def _torch_random(seed: list[int]) -> torch.Generator:
     return torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] >> 1))
 
 
-def _save(run: Run, networks: Networks, optimizer: torch.optim.Optimizer, stage: int, step: int, total: int) -> None:
-    """`stage` and `step` are where to go on; `total` counts steps over all stages and names the checkpoint."""
+def _not_finite(loss: Tensor, network: torch.nn.Module) -> str:
+    """What is not finite before a step: "the loss", "the gradient", or nothing."""
+    if not torch.isfinite(loss):
+        return "the loss"
+    gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
+    return "" if torch.isfinite(torch.nn.utils.get_total_norm(gradients)) else "the gradient"
+
+
+def _keep_batch(
+    run: Run, pools: dict[str, _Pool], rows: dict[str, Tensor], losses: dict[str, Tensor], total: int
+) -> str:
+    """Write the batch that went wrong beside the checkpoints; half a sentence about where it lies."""
+    kept = {f"loss.{name}": value for name, value in losses.items()}
+    for key, chosen in rows.items():
+        pool = pools[key]
+        for name in ("weights", "described", "seen"):
+            values = getattr(pool, name)
+            if len(values) == len(pool.weights):  # a pool that is not pictured has none
+                kept[f"{key}.{name}"] = values[chosen]
+    path = run.folder / "failed" / f"step-{total:08d}.safetensors"
+    try:
+        path.parent.mkdir(exist_ok=True)
+        save_tensors(kept, path)
+    except OSError as error:
+        return f"the batch could not be kept ({error}), "
+    return f"the batch is in {path}, "
+
+
+def _save(
+    run: Run,
+    lock: RunLock,
+    networks: Networks,
+    optimizer: torch.optim.Optimizer,
+    stage: int,
+    step: int,
+    total: int,
+) -> None:
+    """`stage` and `step` are where to go on; `total` counts steps over all stages and names the checkpoint.
+
+    Raises:
+        ReenactError: Another process trains in the folder by now, or a number in a network or optimizer is not finite.
+        OSError: The checkpoint cannot be written.
+    """
+    lock.check()
     tensors = {f"networks.{name}": tensor for name, tensor in networks.state_dict().items()}
     optimizer_tensors, optimizer_state = flatten_optimizer(optimizer)
     tensors |= optimizer_tensors
+    strange = [name for name, tensor in tensors.items() if not bool(torch.isfinite(tensor).all())]
+    if strange:
+        raise ReenactError(
+            f"{run.folder}: {strange[0]} became infinite or no number by step {step} and was not saved; the last "
+            "checkpoint is intact, lower the learning rate and train again"
+        )
     state = {"stage": stage, "step": step, "optimizer": optimizer_state}
     save_checkpoint(run.folder, total, tensors, state, keep=run.config.training.keep)
 
@@ -576,25 +675,92 @@ def _progress(console: Console) -> Iterator[Callable[[str, int, int, dict[str, f
         yield show
 
 
+class _Interrupts:
+    """Ctrl-C, SIGTERM and a lost terminal: they end work at once, or ask for its end where work is patient."""
+
+    def __init__(self) -> None:
+        self.asked: BaseException | None = None
+        """What ends the training, once somebody has asked."""
+        self._patient = False
+
+    def hear(self, number: int, _frame: object) -> None:
+        """Handler of the signals; a second Ctrl-C stops at once, anything else that follows the first is ignored."""
+        if self.asked is not None:
+            if number == signal.SIGINT:
+                raise KeyboardInterrupt
+            return
+        self.asked = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
+        if not self._patient:
+            raise self.asked
+
+    @contextmanager
+    def patiently(self) -> Iterator[None]:
+        """Work that must not be torn: it looks at `asked` by itself."""
+        before, self._patient = self._patient, True
+        try:
+            yield
+        finally:
+            self._patient = before
+
+    @contextmanager
+    def promptly(self) -> Iterator[None]:
+        """Work that can be dropped anywhere, inside patient work."""
+        before, self._patient = self._patient, False
+        try:
+            if self.asked is not None:
+                raise self.asked
+            yield
+        finally:
+            self._patient = before
+
+
 @contextmanager
-def _interrupts() -> Iterator[Callable[[], BaseException | None]]:
-    """Ctrl-C and SIGTERM ask for a save after the current step; a second Ctrl-C stops at once."""
-    asked: list[BaseException] = []
-
-    def ask(number: int, _frame: object) -> None:
-        if asked:
-            raise KeyboardInterrupt
-        asked.append(KeyboardInterrupt() if number == signal.SIGINT else SystemExit(143))
-
+def _interrupts() -> Iterator[_Interrupts]:
+    """Listens to signals for the length of a `with` block."""
+    interrupts, previous = _Interrupts(), {}
+    hangup = getattr(signal, "SIGHUP", None)  # Windows has none
+    for number in (signal.SIGINT, signal.SIGTERM, hangup):
+        if number is None or (number == hangup and signal.getsignal(number) == signal.SIG_IGN):  # nohup
+            continue
+        try:
+            previous[number] = signal.signal(number, interrupts.hear)
+        except ValueError:  # not the main thread: signals are somebody else's
+            break
     try:
-        previous = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # not the main thread: signals are somebody else's
-        previous = {}
-    try:
-        yield lambda: asked[0] if asked else None
+        yield interrupts
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+class _Output:
+    """Standard output that falls silent, instead of failing, once nobody is there: a training outlives its terminal."""
+
+    def __init__(self) -> None:
+        self._stream = sys.stdout
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        self._try(self._stream.write, text)
+        return len(text)
+
+    def flush(self) -> None:
+        self._try(self._stream.flush)
+
+    def _try(self, call: Callable[..., object], *arguments: str) -> None:
+        try:
+            call(*arguments)
+        except OSError:
+            try:  # what is buffered must go somewhere, or Python complains when it ends
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
+            except OSError:
+                self._stream = io.StringIO()
+
+
+def _say_stopped(console: Console, run: Run) -> None:
+    console.print(f"Stopped and saved. Go on with: reenact train --run {_quoted(run)} --resume", soft_wrap=True)
 
 
 def _say_next(console: Console, run: Run) -> None:

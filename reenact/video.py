@@ -19,7 +19,7 @@ from PIL import Image
 from torch import Tensor
 
 from reenact.atomic import replacing
-from reenact.errors import ReenactError
+from reenact.errors import MissingError, ReenactError
 from reenact.portrait import BACKGROUND, Portrait
 from reenact.rigs.clip import Clip
 from reenact.rigs.files import load_clip, load_rig
@@ -159,7 +159,7 @@ def check_out(out: Path, audio: Path | None = None) -> None:
     if suffix not in SUFFIXES:
         raise ReenactError(f"{out}: expected .mp4, .gif, or a folder for pictures, got {suffix}")
     if not out.absolute().parent.is_dir():
-        raise FileNotFoundError(f"{out}: the folder {out.parent} does not exist; make it first")
+        raise MissingError(f"{out}: the folder {out.parent} does not exist; make it first")
     if suffix and out.is_dir():
         raise ReenactError(f"{out}: expected a file to write, got a folder; name a file in it")
     if not suffix and out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -243,7 +243,10 @@ def _save_mp4(
         finally:
             writer.close()
         # ffmpeg reports a full disk only in its log: count what is there before it gets its name.
-        there = imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+        try:
+            there = imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+        except RuntimeError:  # it cannot even read it
+            there = 0
         if there < count and audio is None:
             raise OSError(f"{out}: expected {count} frames, ffmpeg wrote {there}; is the disk full?")
 

@@ -80,6 +80,7 @@ def test_help_names_every_command(capsys):
         ("convert", ["IN", "OUT", "--rig RIG", "--parts NAME", "--fps", "--post.smooth FLOAT"]),
         ("inspect", ["--out FILE.png", "--json FILE.json", "--parts NAME", "looks wrong"]),
         ("rigs", ["--out FILE.png", "--size INT"]),
+        ("doctor", ["--json", "what to do where something is missing or wrong"]),
     ],
 )
 def test_help_of_each_command_is_complete(command, words, capsys):
@@ -224,8 +225,19 @@ def test_a_mistake_is_one_sentence_before_any_work(arguments, sentence, tmp_path
     ("error", "status", "text"),
     [
         (ReenactError("[red]x.glb[/red]: as it is"), 2, "error: [red]x.glb[/red]: as it is\n"),
-        (PermissionError(13, "Permission denied", "a/b"), 2, "error: a/b: Permission denied\n"),
-        (OSError(28, "No space left on device"), 2, "error: No space left on device\n"),
+        (
+            PermissionError(13, "Permission denied", "a/b"),
+            2,
+            "error: a/b: Permission denied; name a place where you may read and write\n",
+        ),
+        (FileNotFoundError(2, "No such file or directory", "a"), 2, "error: a: No such file or directory\n"),
+        (OSError(28, "No space left on device", "a"), 2, f"error: a: No space left on device{cli._REMEDIES[28]}\n"),
+        (
+            MemoryError(),
+            2,
+            "error: rigs: expected more memory than there is; take fewer vertices, shapes or "
+            "frames, or smaller images\n",
+        ),
         (KeyboardInterrupt(), 130, "stopped: by the keyboard\n"),
     ],
 )
@@ -238,13 +250,16 @@ def test_errors_of_the_user_and_the_machine_are_one_line(error, status, text, mo
     assert capsys.readouterr().err == text
 
 
-def test_our_own_mistakes_keep_their_traceback(monkeypatch):
+def test_our_own_mistakes_keep_their_traceback_and_say_how_to_report_them(monkeypatch, capsys):
     def fail():
         raise RuntimeError("ours")
 
     monkeypatch.setitem(cli.COMMANDS, "rigs", fail)
-    with pytest.raises(RuntimeError, match="ours"):
-        main(["rigs"])
+    assert main(["rigs"]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("Traceback (most recent call last):\n")
+    assert "RuntimeError: ours\nour mistake: this is a fault in Reenact" in err
+    assert "`reenact doctor`" in err
 
 
 def test_warnings_are_one_line_each(monkeypatch, capsys):

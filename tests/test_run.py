@@ -130,7 +130,7 @@ def test_the_folder_that_the_user_stands_in_is_taken_over(quick, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     run = Run.create(replace(quick, run="."))
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["config.toml", "correspondences", "layouts.safetensors", "rigs"]
+    assert names == ["config.toml", "correspondences", "format.json", "layouts.safetensors", "rigs"]
     assert Run.open(run.folder).keys == ["ball", "egg"]
 
 

@@ -25,7 +25,7 @@ from reenact.pairs import Pairs, Teacher
 from reenact.rigs.clip import Clip
 from reenact.rigs.motion import expressions
 from reenact.run import Run, networks_state
-from reenact.training import _interrupts, _Log, _preview, _say_next, _step_count, learning_rate, train
+from reenact.training import _interrupts, _Log, _Output, _preview, _say_next, _step_count, learning_rate, train
 
 
 def _trained(config, folder, **training):
@@ -312,13 +312,50 @@ def test_the_commands_to_go_on_with_can_be_pasted(toy_run):
     assert "  reenact evaluate 'my runs/[b]'\n" in said.getvalue()
 
 
-def test_sigterm_asks_once_and_a_second_interrupt_stops_at_once():
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_asks_once_and_a_second_interrupt_stops_at_once(number, status):
     before = signal.getsignal(signal.SIGINT)  # ignored where a shell started the tests in the background
-    with _interrupts() as interrupted:
-        assert interrupted() is None
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert isinstance(interrupted(), SystemExit)
-        assert interrupted().code == 143
-        with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
+    with _interrupts() as interrupts:
+        with interrupts.patiently():
+            assert interrupts.asked is None
+            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), number)  # those who end a whole group of processes may send two
+            assert isinstance(interrupts.asked, SystemExit)
+            assert interrupts.asked.code == status
+            with pytest.raises(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+        with pytest.raises(SystemExit), interrupts.promptly():
+            pytest.fail("what is asked already ends what need not be finished before it begins")
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_signal_ends_what_need_not_be_finished_at_once():
+    with _interrupts() as interrupts, interrupts.patiently(), pytest.raises(SystemExit), interrupts.promptly():
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert interrupts.asked.code == 143
+
+
+def test_a_training_under_nohup_outlives_its_terminal():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with _interrupts() as interrupts:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert interrupts.asked is None
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_output_that_nobody_reads_any_more_stops_nothing(monkeypatch):
+    reader, writer = os.pipe()
+    with os.fdopen(writer, "w") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        output = _Output()
+        os.close(reader)
+        for _ in range(2):
+            assert output.write("text") == 4
+            output.flush()
+    closed = io.StringIO()
+    closed.write = lambda _: (_ for _ in ()).throw(OSError(5, "Input/output error"))
+    monkeypatch.setattr(sys, "stdout", closed)
+    for _ in range(2):
+        _Output().write("text")
