@@ -160,7 +160,7 @@ def evaluate(
         suite: Instead of runs, from anny:man to the other built-in characters: `geometric`, every geometric method by
             correspondences that are found; `transfer`, those and networks, trained by each of --configs.
         rigs: Files of further rigs for the suite, there and back.
-        methods: Only these geometric methods of the suite; the word none leaves them out.
+        methods: Geometric methods to measure beside the runs; of the suite only these, or with the word none no such.
         configs: Settings of networks for the suite.
         targets: Only these built-in characters; the word none leaves them out.
         seeds: How many seeds of clips and training the suite takes, from --seed on.
@@ -182,10 +182,14 @@ def evaluate(
     console, results = Console(markup=False, emoji=False), []
     for run in runs:
         with console.status(f"{run}") as status:
-            results.append(evaluate(run, frames, seed, lambda stage, run=run, s=status: s.update(f"{run}: {stage}")))
+            results.append(
+                evaluate(run, frames, seed, lambda stage, run=run, s=status: s.update(f"{run}: {stage}"), methods)
+            )
         for table in _tables(results[-1]):
             console.print(table)
-    console.print(f"Report: {write_report(list(runs), results)}", highlight=False, soft_wrap=True)
+    with console.status("Writing the report"):
+        page = write_report(list(runs), results)
+    console.print(f"Report: {page}", highlight=False, soft_wrap=True)
 
 
 def view(
@@ -729,7 +733,15 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
     }.items():
         for name in names:
             alone.add_row(f"{group}.{name}", _number(numbers[group][name]))
-    return [compared, alone]
+    if not numbers["methods"]:
+        return [compared, alone]
+    others = Table(title="Geometric methods, the same frames", title_justify="left")
+    others.add_column("", no_wrap=True)
+    for name in measures["truth"]:
+        others.add_column(f"truth.{name}", justify="right")
+    for method, row in numbers["methods"].items():
+        others.add_row(method, *(_number((row["truth"] or {}).get(name)) for name in measures["truth"]))
+    return [compared, others, alone]
 
 
 def _number(value: float | None) -> str:
