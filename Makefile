@@ -1,6 +1,7 @@
 # make demo    train a small pair of networks, retarget a clip, evaluate: minutes on two cores
 # make test    run the tests
 # make lint    what CI asks of the code's form
+# make docs    the documentation, to open in a browser: runs/docs/index.html
 # make bench   the measurements behind our claims, as JSON in runs/bench
 # make setup   only the environment, in .venv; the others do this first, once
 
@@ -17,7 +18,7 @@ RUN ?= runs/demo
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: setup demo test lint bench
+.PHONY: setup demo test lint docs bench
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -66,6 +67,11 @@ test: $(READY)
 lint: $(READY)
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
+
+docs: $(READY)
+	@$(BIN)/python docs/config_page.py
+	@$(BIN)/python -m sphinx -b html -q -W --keep-going -d runs/docs/.cache docs runs/docs
+	@echo "Documentation   runs/docs/index.html"
 
 bench: $(READY)
 	@mkdir -p runs/bench

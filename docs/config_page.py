@@ -1,6 +1,6 @@
 """Writes docs/config.md, the page of all settings, from the docstrings of reenact/config.py.
 
-    python docs/config_page.py
+python docs/config_page.py
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import inspect
 import re
 import sys
 from dataclasses import fields, is_dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -20,9 +21,9 @@ from reenact import config
 PAGE = Path(__file__).with_name("config.md")
 HEAD = """# Every setting
 
-A run is a TOML file that lists what differs from the defaults, and options of the same names on the command line, which win:
-`reenact train --config FILE.toml --training.steps 2000`. An unknown key is refused, with the nearest known one. A run folder
-keeps every value in `RUN/config.toml`. This page is made from [`reenact/config.py`](../reenact/config.py) by
+A run is a TOML file that lists what differs from the defaults, and options of the same names on the command line, which
+win: `reenact train --config FILE.toml --training.steps 2000`. An unknown key is refused, with the nearest known one. A
+run folder keeps every value in `RUN/config.toml`. This page is made from [`reenact/config.py`](../reenact/config.py) by
 `python docs/config_page.py`.
 """
 
@@ -70,7 +71,7 @@ def _docstrings(kind: type) -> dict[str, str]:
     body = ast.parse(inspect.getsource(kind)).body[0].body
     return {
         field.target.id: _joined(text.value.value)
-        for field, text in zip(body, body[1:])
+        for field, text in pairwise(body)
         if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr)
     }
 

@@ -257,12 +257,16 @@ def render(
         raise ReenactError(f"--size: expected 16 to 4096 pixels, got {size}")
     from rich.progress import Progress
 
+    from reenact.rigs.timeline import resampled
     from reenact.video import check_out, performances, save_video
 
     check_out(out, audio)
     console = Console(stderr=True)
     with console.status("Loading"):
         played = performances(inputs, rig, method, fps)
+    if out.suffix.lower() == ".gif" and fps is None and played[0].clip.fps > 50:  # more than the format has
+        print(f"{played[0].clip.fps:g} frames per second became 30: a .gif has at most 50")
+        played = [replace(each, clip=resampled(each.clip, 30)) for each in played]
     clip = played[0].clip
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Drawing", total=len(clip))
@@ -654,6 +658,7 @@ def _plain(name: str) -> str:
 
 def _facts(facts: Inspection) -> list[Any]:
     """What was found in a rig, for the terminal."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     contents = facts.contents
@@ -678,11 +683,14 @@ def _facts(facts: Inspection) -> list[Any]:
     shapes = Table(
         title="Shapes",
         title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
         caption="strength: largest offset, 1 is the distance from eyes to mouth; moved: share of the vertices",
         caption_justify="left",
     )
     shapes.add_column("shape", no_wrap=True)
-    for column in ("ARKit", "strength", "moved", "region", "side"):
+    shapes.add_column("ARKit", no_wrap=True)
+    for column in ("strength", "moved", "region", "side"):
         shapes.add_column(column, justify="right" if column in ("strength", "moved") else "left")
     for shape in facts.shapes:
         known = "same" if shape.arkit == shape.name else shape.arkit or "-"
@@ -708,6 +716,7 @@ def _check_out(path: Path, suffixes: tuple[str, ...]) -> None:
 
 def _tables(numbers: dict[str, Any]) -> list[Table]:
     """What one evaluation found, for the terminal."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     columns = {"this run": numbers, "direct": numbers["direct"]}
@@ -715,7 +724,8 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
     columns |= {name.replace("_", " "): row for name, row in numbers["baselines"].items()}
     title = f"{numbers['run']}: {numbers['source']} -> {numbers['target']}, {numbers['frames']} unseen frames"
     caption = "direct: without ReenactNet" + "; pairs: of shapes, without any network" * bool(numbers["paired"])
-    compared = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    look: dict[str, Any] = {"title_justify": "left", "box": SIMPLE_HEAD, "pad_edge": False}  # 80 columns hold them
+    compared = Table(title=title, caption=caption, caption_justify="left", **look)
     compared.add_column("", no_wrap=True)
     for name in columns:
         compared.add_column(name, justify="right")
@@ -724,7 +734,7 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
         for name in names:
             values = [(row[group] or {}).get(name) for row in columns.values()]
             compared.add_row(f"{group}.{name}", *map(_number, values))
-    alone = Table(title="BPNet alone; speed", title_justify="left")
+    alone = Table(title="BPNet alone; speed", **look)
     alone.add_column("", no_wrap=True)
     alone.add_column("value", justify="right")
     for group, names in {
@@ -735,7 +745,7 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
             alone.add_row(f"{group}.{name}", _number(numbers[group][name]))
     if not numbers["methods"]:
         return [compared, alone]
-    others = Table(title="Geometric methods, the same frames", title_justify="left")
+    others = Table(title="Geometric methods, the same frames", **look)
     others.add_column("", no_wrap=True)
     for name in measures["truth"]:
         others.add_column(f"truth.{name}", justify="right")
