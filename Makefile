@@ -1,6 +1,8 @@
 # make demo    train a small pair of networks, retarget a clip, evaluate: minutes on two cores
 # make test    run the tests
 # make lint    what CI asks of the code's form
+# make docs    the documentation, to open in a browser: runs/docs/index.html
+# make gallery one clip on everyone, and by every method, as a page: runs/gallery.html
 # make bench   the measurements behind our claims, as JSON in runs/bench
 # make setup   only the environment, in .venv; the others do this first, once
 
@@ -17,7 +19,7 @@ RUN ?= runs/demo
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: setup demo test lint bench
+.PHONY: setup demo test lint docs gallery bench
 .DELETE_ON_ERROR:
 
 setup: $(READY)
@@ -67,6 +69,15 @@ test: $(READY)
 lint: $(READY)
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
+
+docs: $(READY)
+	@$(BIN)/python docs/config_page.py
+	@$(BIN)/python -m sphinx -b html -q -W --keep-going -d runs/docs/.cache docs runs/docs
+	@echo "Documentation   runs/docs/index.html"
+
+# With the networks of the demo where they are trained.
+gallery: $(READY)
+	@$(BIN)/python figures/gallery.py $(if $(wildcard $(RUN)/trained),"$(RUN)")
 
 bench: $(READY)
 	@mkdir -p runs/bench

@@ -164,7 +164,7 @@ def evaluate(
         suite: Instead of runs, from anny:man to the other built-in characters: `geometric`, every geometric method by
             correspondences that are found; `transfer`, those and networks, trained by each of --configs.
         rigs: Files of further rigs for the suite, there and back.
-        methods: Only these geometric methods of the suite; the word none leaves them out.
+        methods: Geometric methods to measure beside the runs; of the suite only these, or with the word none no such.
         configs: Settings of networks for the suite.
         targets: Only these built-in characters; the word none leaves them out.
         seeds: How many seeds of clips and training the suite takes, from --seed on.
@@ -186,10 +186,14 @@ def evaluate(
     console, results = Console(markup=False, emoji=False), []
     for run in runs:
         with console.status(f"{run}") as status:
-            results.append(evaluate(run, frames, seed, lambda stage, run=run, s=status: s.update(f"{run}: {stage}")))
+            results.append(
+                evaluate(run, frames, seed, lambda stage, run=run, s=status: s.update(f"{run}: {stage}"), methods)
+            )
         for table in _tables(results[-1]):
             console.print(table)
-    console.print(f"Report: {write_report(list(runs), results)}", highlight=False, soft_wrap=True)
+    with console.status("Writing the report"):
+        page = write_report(list(runs), results)
+    console.print(f"Report: {page}", highlight=False, soft_wrap=True)
 
 
 def view(
@@ -257,12 +261,16 @@ def render(
         raise ReenactError(f"--size: expected 16 to 4096 pixels, got {size}")
     from rich.progress import Progress
 
+    from reenact.rigs.timeline import resampled
     from reenact.video import check_out, performances, save_video
 
     check_out(out, audio)
     console = Console(stderr=True)
     with console.status("Loading"):
         played = performances(inputs, rig, method, fps)
+    if out.suffix.lower() == ".gif" and fps is None and played[0].clip.fps > 50:  # more than the format has
+        print(f"{played[0].clip.fps:g} frames per second became 30: a .gif has at most 50")
+        played = [replace(each, clip=resampled(each.clip, 30)) for each in played]
     clip = played[0].clip
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Drawing", total=len(clip))
@@ -711,6 +719,7 @@ def _plain(name: str) -> str:
 
 def _facts(facts: Inspection) -> list[Any]:
     """What was found in a rig, for the terminal."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     contents = facts.contents
@@ -735,11 +744,14 @@ def _facts(facts: Inspection) -> list[Any]:
     shapes = Table(
         title="Shapes",
         title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
         caption="strength: largest offset, 1 is the distance from eyes to mouth; moved: share of the vertices",
         caption_justify="left",
     )
     shapes.add_column("shape", no_wrap=True)
-    for column in ("ARKit", "strength", "moved", "region", "side"):
+    shapes.add_column("ARKit", no_wrap=True)
+    for column in ("strength", "moved", "region", "side"):
         shapes.add_column(column, justify="right" if column in ("strength", "moved") else "left")
     for shape in facts.shapes:
         known = "same" if shape.arkit == shape.name else shape.arkit or "-"
@@ -765,6 +777,7 @@ def _check_out(path: Path, suffixes: tuple[str, ...]) -> None:
 
 def _tables(numbers: dict[str, Any]) -> list[Table]:
     """What one evaluation found, for the terminal."""
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     columns = {"this run": numbers, "direct": numbers["direct"]}
@@ -772,7 +785,8 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
     columns |= {name.replace("_", " "): row for name, row in numbers["baselines"].items()}
     title = f"{numbers['run']}: {numbers['source']} -> {numbers['target']}, {numbers['frames']} unseen frames"
     caption = "direct: without ReenactNet" + "; pairs: of shapes, without any network" * bool(numbers["paired"])
-    compared = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    look: dict[str, Any] = {"title_justify": "left", "box": SIMPLE_HEAD, "pad_edge": False}  # 80 columns hold them
+    compared = Table(title=title, caption=caption, caption_justify="left", **look)
     compared.add_column("", no_wrap=True)
     for name in columns:
         compared.add_column(name, justify="right")
@@ -781,7 +795,7 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
         for name in names:
             values = [(row[group] or {}).get(name) for row in columns.values()]
             compared.add_row(f"{group}.{name}", *map(_number, values))
-    alone = Table(title="BPNet alone; speed", title_justify="left")
+    alone = Table(title="BPNet alone; speed", **look)
     alone.add_column("", no_wrap=True)
     alone.add_column("value", justify="right")
     for group, names in {
@@ -790,7 +804,15 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
     }.items():
         for name in names:
             alone.add_row(f"{group}.{name}", _number(numbers[group][name]))
-    return [compared, alone]
+    if not numbers["methods"]:
+        return [compared, alone]
+    others = Table(title="Geometric methods, the same frames", **look)
+    others.add_column("", no_wrap=True)
+    for name in measures["truth"]:
+        others.add_column(f"truth.{name}", justify="right")
+    for method, row in numbers["methods"].items():
+        others.add_row(method, *(_number((row["truth"] or {}).get(name)) for name in measures["truth"]))
+    return [compared, others, alone]
 
 
 def _number(value: float | None) -> str:

@@ -186,6 +186,8 @@ class TrainingConfig:
     """Newest checkpoints that are kept."""
     threads: int | None = None
     """CPU threads; None takes all cores."""
+    tensorboard: bool = False
+    """Write losses and previews to RUN/tensorboard as well; needs `reenact[tensorboard]`."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import io
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -31,6 +31,8 @@ from torch import Tensor
 
 from reenact.atomic import write_atomically
 from reenact.errors import ReenactError
+from reenact.retargeting.correspondence import Correspondence, find_correspondence
+from reenact.retargeting.retargeter import Retargeter
 from reenact.rigs import motion
 from reenact.rigs.arkit import canonical
 from reenact.rigs.clip import Clip
@@ -435,32 +437,49 @@ def held_out_clips(names: tuple[str, ...], frames: int, seed: int, fps: float = 
     return clips
 
 
-def evaluate(run_dir: Path, frames: int = 600, seed: int = 0, say: Callable[[str], None] = lambda _: None) -> dict:
+def evaluate(
+    run_dir: Path,
+    frames: int = 600,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda _: None,
+    methods: Sequence[str] = (),
+) -> dict:
     """The numbers of a finished run, also written to `RUN/evaluation/metrics.json`.
 
     Beside it `frames.npz` keeps the weights of every held-out frame (source, predicted, truth where known, recovered,
-    direct) and the error maps, for reports and for those who want to look closer.
+    direct, methods) and the error maps, for reports and for those who want to look closer.
 
     Args:
         run_dir: Folder that training wrote.
         frames: Held-out frames in all; their pictures stay in memory, some 0.1 GB per 600 at 64 pixels.
         seed: Of the held-out clips; the same seed gives the same clips for every run on the same rigs.
         say: Called with a few words before each stage.
+        methods: Geometric methods to measure beside it, on the same frames.
 
     Returns:
         See `evaluate_retargeters`, and `run`, the folder's name.
 
     Raises:
-        ReenactError: Too few frames; the run cannot be loaded.
+        ReenactError: Too few frames; an unknown method, or one that cannot work on these rigs; the run cannot be
+            loaded.
     """
     from reenact.inference import ImageRetargeter
+    from reenact.retargeting import METHODS
+
+    for name in methods:
+        if name not in METHODS:
+            raise ReenactError(f"evaluation: expected methods among {', '.join(METHODS)}, got {name}")
 
     if frames < 3 * len(KINDS):
         held_out_clips((), frames, seed)  # raises before the slow loading
     say("loading the networks")
     forward = ImageRetargeter.load(run_dir)
     reverse = ImageRetargeter.load(run_dir, reverse=True)
-    numbers, arrays = evaluate_retargeters(forward, reverse, frames, seed, say)
+    others = {}
+    for name in methods:
+        say(f"preparing {name}")
+        others[name] = METHODS[name](forward.source, forward.target, _correspondence(forward, name))
+    numbers, arrays = evaluate_retargeters(forward, reverse, frames, seed, say, others)
     numbers = {"run": run_dir.resolve().name, **numbers}
     folder = run_dir / "evaluation"
     folder.mkdir(parents=True, exist_ok=True)
@@ -471,6 +490,18 @@ def evaluate(run_dir: Path, frames: int = 600, seed: int = 0, say: Callable[[str
     return numbers
 
 
+def _correspondence(forward: Any, method: str) -> Correspondence | None:
+    """The one that the run found, or found now; names alone need none."""
+    if method in ("copy", "neutral"):
+        return None
+    known, (source, target) = forward.run.correspondences, forward.keys
+    if (source, target) in known:
+        return known[source, target]
+    if (target, source) in known:
+        return known[target, source].reversed()
+    return find_correspondence(forward.source, forward.target, forward.run.config.pairs.markers)
+
+
 @torch.no_grad()
 def evaluate_retargeters(
     forward: PictureRetargeter,
@@ -478,6 +509,7 @@ def evaluate_retargeters(
     frames: int = 600,
     seed: int = 0,
     say: Callable[[str], None] = lambda _: None,
+    methods: Mapping[str, Retargeter] | None = None,
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """All numbers of a pair of retargeters, and the frames they were measured on.
 
@@ -502,12 +534,13 @@ def evaluate_retargeters(
           earns its place by beating it.
         - `paired`: the pairs of shapes that training found, applied to the weights without any network; None without
           pairs. Zero where every shape of one rig has its partner on the other: read `truth` beside it.
+        - `methods`: the `truth` of each of `methods`, None without one.
         - `kinds`: `truth` and `cyclic` per kind of clip. `shapes`: `per_shape` by name. `worst`: frames by falling
           vertex error.
 
         Numbers over all kinds pool the frames; jitter is the mean of the clips.
-        Arrays, per frame: `source`, `predicted`, `recovered`, `direct` weights, `kind` (index into `KINDS`); `truth`
-        and `error` (metres) where known; error maps `map_cyclic`, `map_cyclic_neutral`, `map_truth`,
+        Arrays, per frame: `source`, `predicted`, `recovered`, `direct`, `method NAME` weights, `kind` (index into
+        `KINDS`); `truth` and `error` (metres) where known; error maps `map_cyclic`, `map_cyclic_neutral`, `map_truth`,
         `map_truth_neutral` (H, W).
 
     Source: cyclic protocol of Kim et al. 2021, Sec. 4; all else is ours.
@@ -556,6 +589,8 @@ def evaluate_retargeters(
             answers["direct"] = _in_chunks(forward.read_direct, pictures)
         if paired is not None:
             answers["paired"] = forward.paired(known)
+        for name, method in (methods or {}).items():
+            answers[f"method {name}"] = _retarget(method, _split(source.names, known, kinds, fps))
         answers |= {
             "neutral": torch.zeros_like(truth),
             "mean_pose": truth.mean(0).expand_as(truth),
@@ -609,6 +644,7 @@ def evaluate_retargeters(
         "baselines": {name: summary(name, "all") for name in ("neutral", "mean_pose", "shuffled")},
         "direct": summary("direct", "all"),
         "paired": None if paired is None else summary("paired", "all"),
+        "methods": {name: {"truth": true[f"method {name}"]["all"] if true else None} for name in methods or {}},
         "kinds": {kind: summary("reenact", kind) for kind in kinds},
         "shapes": shapes,
         "worst": worst,
@@ -622,6 +658,9 @@ def evaluate_retargeters(
         "map_cyclic": cycle.maps["reenact"],
         "map_cyclic_neutral": cycle.maps["neutral"],
     }
+    say("comparing methods")
+    for name, method in (methods or {}).items():
+        arrays[f"method {name}"] = _retarget(method, clips).numpy()
     return numbers, arrays
 
 
@@ -794,7 +833,7 @@ def speed(
     }
 
 
-def _retarget(retargeter: PictureRetargeter, clips: dict[str, Clip]) -> Tensor:
+def _retarget(retargeter: Retargeter | PictureRetargeter, clips: dict[str, Clip]) -> Tensor:
     return torch.cat([retargeter(clip).weights.detach().float().cpu() for clip in clips.values()])
 
 

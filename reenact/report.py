@@ -1,8 +1,9 @@
 """Report: what a run is worth, on one page that anyone can open, print or send.
 
 `write_report` turns the numbers of `reenact.evaluation` into RUN/report.html: two faces moving side by side, a verdict
-in plain words, the numbers beside the trivial baselines, the worst frames first, curves, error maps. The page holds all
-of its pictures and asks no server for anything. `python -m reenact.report RUN [RUN ...]` remakes it without evaluating.
+in plain words, the numbers beside the trivial baselines, the worst frames first, curves of every shape, what each shape
+does alone, error on the face. The page holds all of its pictures and asks no server for anything.
+`python -m reenact.report RUN [RUN ...]` remakes it without evaluating.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import shlex
 import sys
 import tomllib
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -27,8 +29,10 @@ from torch import Tensor
 
 from reenact.atomic import write_atomically
 from reenact.errors import ReenactError
-from reenact.evaluation import KINDS, PictureRetargeter, finite
+from reenact.evaluation import KINDS, PictureRetargeter, finite, true_weights, vertex_errors
 from reenact.portrait import Portrait
+from reenact.rigs import arkit
+from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
 PLAYER_FRAMES = 96
@@ -37,7 +41,12 @@ PLAYER_SIZE = 256
 """Pixels of the faces in the player."""
 SHEET_SIZE = 144
 """Pixels of the faces in contact sheets."""
+HEAT_SIZE = 320
+"""Pixels of the faces that show where the error is."""
+MOST_SHAPES = 90
+"""Rows of the table of single shapes; more could not be read."""
 
+_HEAT = "OrRd"  # light where nothing is: shading stays visible
 _PLAYED = ("mixed", "emotion")  # kinds of clips that the player shows: what a newcomer takes for a performance
 _BASELINES = {"neutral": "neutral, never moves", "mean_pose": "mean pose", "shuffled": "shuffled truth"}
 _KIND_TITLES = {
@@ -78,14 +87,23 @@ def write_report(
 
         load = ImageRetargeter.load
     share = max(24, PLAYER_FRAMES // len(run_dirs))  # a page of many runs stays small enough to send
-    runs = [_run(Path(folder), finite(result), load, share) for folder, result in zip(run_dirs, results, strict=True)]
+    runs = [
+        _run(index, Path(folder), finite(result), load, share)
+        for index, (folder, result) in enumerate(zip(run_dirs, results, strict=True))
+    ]
+    together = _together(runs)
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string(files("reenact").joinpath("report.html").read_text(encoding="utf-8"))
     page = template.render(
         title=f"{runs[0]['source']} → {runs[0]['target']}" if len(runs) == 1 else f"{len(runs)} runs",
         runs=runs,
-        players=[run["player"]["script"] if run["player"] else None for run in runs],
+        players=[run["player"]["script"] for run in runs],
+        curves=[run["every_curve"] for run in runs],
+        together=together,
         comparison=_comparison(runs) if len(runs) > 1 else [],
+        one_direction=len({(run["source"], run["target"]) for run in runs}) == 1,
+        compared=compared(runs) if len(runs) > 1 else "",
+        shared=_shared_commands(run_dirs, results) if len(runs) > 1 else [],
     )
     path = Path(run_dirs[0]) / "report.html"
     write_atomically(path, page.encode())
@@ -156,7 +174,9 @@ def verdict(result: dict[str, Any]) -> str:
 # One run -------------------------------------------------------------------------------------------------------------
 
 
-def _run(folder: Path, result: dict[str, Any], load: Callable[[Path], PictureRetargeter], share: int) -> dict[str, Any]:
+def _run(
+    index: int, folder: Path, result: dict[str, Any], load: Callable[[Path], PictureRetargeter], share: int
+) -> dict[str, Any]:
     """What the template shows of one run."""
     stored = folder / "evaluation" / "frames.npz"
     if not stored.is_file():
@@ -180,11 +200,15 @@ def _run(folder: Path, result: dict[str, Any], load: Callable[[Path], PictureRet
         "verdict": verdict(result),
         "facts": _facts(folder, result),
         "figures": _figures(result),
-        "player": _player(forward, arrays, frames),
+        "player": _player(index, forward, arrays, frames),
+        "moved": arrays["source"][frames],
         "methods": _methods(result),
         "kinds": _kinds(result),
         "sheets": _sheets(forward, arrays, result),
         "curves": _curves(forward.target, arrays, _span(frames)),
+        "every_curve": _every_curve(forward.target, arrays, result),
+        "alone": _alone(forward),
+        "heat": _heat(forward.target, arrays),
         "curve_length": len(_span(frames)),
         "cuts": _cuts(arrays["kind"][_span(frames)]),
         "maps": maps,
@@ -249,6 +273,7 @@ def _methods(result: dict[str, Any]) -> list[dict[str, Any]]:
         ("this run", {"truth": result.get("truth"), "cyclic": result["cyclic"]}),
         ("without ReenactNet", result["direct"]),
         *([("the labels that taught it, no network", result["paired"])] if result.get("paired") else []),
+        *((f"{name}, no network", {"cyclic": {}, **numbers}) for name, numbers in result.get("methods", {}).items()),
         *((_BASELINES[name], result["baselines"][name]) for name in _BASELINES),
     ]
     return [{"title": title, "width": _width(row["truth"]), **row} for title, row in rows]
@@ -264,15 +289,60 @@ def _commands(folder: Path, result: dict[str, Any]) -> list[tuple[str, str]]:
     run = shlex.quote(str(folder))
     config = shlex.quote(str(folder / "config.toml"))
     return [
-        ("these numbers and this page", f"reenact evaluate {run} --frames {result['frames']} --seed {result['seed']}"),
+        ("these numbers and this page", f"reenact evaluate {run}{_options([result])}"),
         ("this page alone", f"python -m reenact.report {run}"),
         ("a clip of your own onto the target", f"reenact infer {run} CLIP --out OUT.glb"),
         ("the same training again", f"reenact train --config {config} --run {shlex.quote(str(folder) + '-again')}"),
     ]
 
 
+def _shared_commands(folders: Sequence[Path], results: Sequence[dict]) -> list[tuple[str, str]]:
+    runs = shlex.join(str(folder) for folder in folders)
+    return [
+        ("all these numbers and this page", f"reenact evaluate {runs}{_options(results)}"),
+        ("this page alone", f"python -m reenact.report {runs}"),
+    ]
+
+
+def _options(results: Sequence[dict]) -> str:
+    """What `reenact evaluate` was told beside the runs, where all were told the same."""
+    first = results[0]
+    if any((each["frames"], each["seed"]) != (first["frames"], first["seed"]) for each in results):
+        return ""
+    methods = list(dict.fromkeys(name for each in results for name in each.get("methods", {})))
+    return f" --frames {first['frames']} --seed {first['seed']}" + (f" --methods {' '.join(methods)}" * bool(methods))
+
+
+def compared(runs: list[dict[str, Any]]) -> str:
+    """A sentence for each direction: who comes closest to the truth, and whether the distance means anything."""
+    entries: dict[str, dict[str, tuple[float, float, float]]] = {}
+    for run in runs:
+        known = entries.setdefault(f"{run['source']} → {run['target']}", {})
+        answers = {run["name"]: run["result"].get("truth")}
+        answers |= {name: each["truth"] for name, each in run["result"].get("methods", {}).items()}
+        for name, truth in answers.items():
+            if truth and truth["ver"] is not None:
+                known[name] = (truth["ver"], *truth["ver_interval"])
+    sentences = []
+    for direction, known in entries.items():
+        if len(known) < 2:
+            continue
+        (first, best), (second, next_best) = sorted(known.items(), key=lambda each: each[1])[:2]
+        sure = best[2] < next_best[1]
+        sentences.append(
+            f"{direction}: {first} comes closest to the truth (VER {best[0]:.2f}), {second} follows "
+            f"({next_best[0]:.2f}); "
+            + (
+                "their intervals do not touch, so other frames would hardly change the order."
+                if sure
+                else "their intervals overlap, so other frames could change the order."
+            )
+        )
+    return " ".join(sentences)
+
+
 def _comparison(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row per run, and mean ± standard deviation for each direction that several runs share."""
+    """A row per run and method, and mean ± standard deviation for each direction that several runs share."""
 
     def numbers(result: dict[str, Any]) -> list[float | None]:
         truth, direct = result.get("truth") or {}, result["direct"]["truth"] or {}
@@ -294,6 +364,13 @@ def _comparison(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
         groups.setdefault(direction, []).append(values)
         shown = [_fixed(value, places) for value, places in zip(values, digits)]
         rows.append({"name": run["name"], "href": f"run-{i}", "direction": direction, "values": shown, "mean": False})
+    measured: dict[tuple[str, str], dict[str, Any] | None] = {}
+    for run in runs:
+        for name, each in run["result"].get("methods", {}).items():
+            measured.setdefault((name, f"{run['source']} → {run['target']}"), each["truth"])
+    for (name, direction), truth in measured.items():
+        shown = [_fixed((truth or {}).get(key)) for key in ("ver", "correlation", "gain")] + ["–"] * 4
+        rows.append({"name": name, "href": "", "direction": direction, "values": shown, "mean": False})
     for direction, members in groups.items():
         if len(members) > 1:
             shown = []
@@ -328,13 +405,18 @@ def _cuts(kind: np.ndarray) -> list[int]:
     return (np.flatnonzero(np.diff(kind)) + 1).tolist()
 
 
-def _player(forward: PictureRetargeter, arrays: dict[str, np.ndarray], frames: np.ndarray) -> dict[str, Any]:
+def _player(
+    index: int, forward: PictureRetargeter, arrays: dict[str, np.ndarray], frames: np.ndarray
+) -> dict[str, Any]:
     views = [
         ("Source", forward.source, arrays["source"], False),
         ("Reenacted", forward.target, arrays["predicted"], False),
     ]
     if "truth" in arrays:
         views.append(("Truth", forward.target, arrays["truth"], True))
+    for name in arrays:
+        if name.startswith("method "):
+            views.append((name.removeprefix("method "), forward.target, arrays[name], True))
     columns = 8
     span = _span(frames)
     return {
@@ -342,12 +424,13 @@ def _player(forward: PictureRetargeter, arrays: dict[str, np.ndarray], frames: n
         "count": len(frames),
         "views": [
             {
+                "id": f"sheet-{index}-{place}",
                 "title": title,
                 "subtitle": rig.name,
                 "optional": optional,
                 "sheet": _picture(_grid(_faces(rig, weights[frames], PLAYER_SIZE), columns)),
             }
-            for title, rig, weights, optional in views
+            for place, (title, rig, weights, optional) in enumerate(views)
         ],
         "script": {
             "size": PLAYER_SIZE,
@@ -361,6 +444,24 @@ def _player(forward: PictureRetargeter, arrays: dict[str, np.ndarray], frames: n
             "length": len(span),
         },
     }
+
+
+def _together(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Faces of all runs in step, where one source drives them all: views of their own players; else none."""
+    first = runs[0]
+    if len(runs) < 2 or not all(
+        run["source"] == first["source"] and np.array_equal(run["moved"], first["moved"]) for run in runs
+    ):
+        return []
+    shown, optional, seen = [first["player"]["views"][0]], [], set()
+    for run in runs:
+        _, own, *others = run["player"]["views"]
+        shown.append({**own, "title": run["name"]})
+        for view in others:
+            if (view["title"], view["subtitle"]) not in seen:
+                seen.add((view["title"], view["subtitle"]))
+                optional.append(view)
+    return shown + optional
 
 
 def _sheets(forward: PictureRetargeter, arrays: dict[str, np.ndarray], result: dict[str, Any]) -> list[dict[str, Any]]:
@@ -446,8 +547,8 @@ def _grid(pictures: np.ndarray, columns: int) -> np.ndarray:
     return padded.reshape(rows, columns, height, width, 3).swapaxes(1, 2).reshape(rows * height, columns * width, 3)
 
 
-def _colored(values: np.ndarray, limit: float) -> np.ndarray:
-    return (matplotlib.colormaps["magma"](np.clip(values / limit, 0, 1))[..., :3] * 255).round().astype(np.uint8)
+def _colored(values: np.ndarray, limit: float, colors: str = "magma") -> np.ndarray:
+    return (matplotlib.colormaps[colors](np.clip(values / limit, 0, 1))[..., :3] * 255).round().astype(np.uint8)
 
 
 def _picture(pixels: np.ndarray, kind: str = "WEBP") -> str:
@@ -455,6 +556,147 @@ def _picture(pixels: np.ndarray, kind: str = "WEBP") -> str:
     packed = io.BytesIO()
     Image.fromarray(pixels).save(packed, kind, quality=82)
     return f"data:image/{kind.lower()};base64,{base64.b64encode(packed.getvalue()).decode()}"
+
+
+# What each shape does alone, and where on the face errors are -------------------------------------------------------
+
+
+@torch.no_grad()
+def _alone(forward: PictureRetargeter) -> dict[str, Any]:
+    """Every shape of the source alone at 1: what the target does, beside what it should where names tell."""
+    source, target = forward.source, forward.target
+    alone, names = torch.eye(len(source.names)), list(source.names)
+    meaning = {arkit.canonical(name): k for k, name in enumerate(names)}
+    for shape, base in arkit.CORRECTIVES.items():  # means nothing without the other
+        if shape in meaning and base in meaning:
+            alone[meaning[shape], meaning[base]] = 1
+            names[meaning[shape]] += f" + {base}"
+    known, right, covered = true_weights(source, target, alone)
+    asked = torch.arange(len(alone))
+    if covered:
+        asked = ((known.amax(1) > 0.5) & (right.amax(1) > 0.25)).nonzero().flatten()
+    known, right = (known if covered else alone)[asked], right[asked]
+    answer = forward(Clip(source.names, known, 30.0)).weights.detach().float().cpu()
+    wrong = torch.zeros(len(asked))
+    if covered:
+        distance, motion = vertex_errors(target, answer, right)
+        wrong = (distance / motion.clamp_min(1e-12)).float()
+    found = (answer.argmax(1) == right.argmax(1)) & (answer.amax(1) > 0.05)
+    order = wrong.argsort(descending=True, stable=True)
+    shown = order[:MOST_SHAPES].sort().values if len(order) > MOST_SHAPES else torch.arange(len(asked))
+    names = [names[k] for k in asked.tolist()]
+    return {
+        "has_truth": bool(covered),
+        "sentence": _alone_sentence(target, names, answer, right, wrong, found) if covered else "",
+        "matrix": _matrix([names[k] for k in shown], target.names, answer[shown], right[shown], bool(covered)),
+        "left_out": len(asked) - len(shown),
+        "sheet": _alone_sheet(forward, names, known, answer, right, wrong, order, bool(covered)),
+    }
+
+
+def _alone_sentence(target: Rig, names: list[str], answer: Tensor, right: Tensor, wrong: Tensor, found: Tensor) -> str:
+    sentence = (
+        f"Of {len(names)} shapes whose right answer is known, {int(found.sum())} move the right shape most. "
+        f"The median misses {_percent(float(wrong.median()))} of its motion"
+    )
+    worst = int(wrong.argmax())
+    stray = answer[worst].clone()
+    stray[right[worst] > 0.05] = 0
+    sentence += f"; the worst is {names[worst]}, which misses {_percent(float(wrong[worst]))}"
+    if float(stray.max()) > 0.1:
+        sentence += f" and moves {target.names[int(stray.argmax())]} by {float(stray.max()):.2f}"
+    elif float(answer[worst].max()) < 0.1:
+        sentence += " and hardly moves anything"
+    return sentence + "."
+
+
+def _matrix(
+    rows: list[str], columns: tuple[str, ...], answer: Tensor, right: Tensor, has_truth: bool
+) -> dict[str, Any]:
+    """Cells of the table: columns that anything happens in, ordered so that a perfect answer is a diagonal."""
+    wanted = right if has_truth else answer
+    busy = ((answer > 0.05) | (right > 0.05)).any(0).nonzero().flatten().tolist()
+    first = {}
+    for k in busy:
+        most = float(wanted[:, k].max())
+        first[k] = int((wanted[:, k] >= most - 1e-6).nonzero()[0]) if most > 0.05 else len(rows)
+    busy.sort(key=lambda k: (first[k], k))
+    place = {k: x for x, k in enumerate(busy)}
+    cells = []
+    for y, name in enumerate(rows):
+        for k in busy:
+            does, should = float(answer[y, k]), float(right[y, k])
+            if does > 0.05 or should > 0.05:
+                told = f"{name} → {columns[k]} {does:.2f}" + (f", should be {should:.2f}" if has_truth else "")
+                cells.append({"x": place[k], "y": y, "does": round(does, 2), "should": should > 0.05, "told": told})
+    return {"rows": rows, "columns": [columns[k] for k in busy], "cells": cells}
+
+
+def _alone_sheet(
+    forward: PictureRetargeter,
+    names: list[str],
+    known: Tensor,
+    answer: Tensor,
+    right: Tensor,
+    wrong: Tensor,
+    order: Tensor,
+    has_truth: bool,
+) -> dict[str, Any]:
+    """Faces of the six shapes that are farthest off; of six at equal steps where nothing tells."""
+    chosen = order[:6] if has_truth else torch.linspace(0, len(names) - 1, min(6, len(names))).long()
+    rows = [
+        (f"source, {forward.source.name}", _faces(forward.source, known[chosen].numpy(), SHEET_SIZE)),
+        (f"{forward.target.name}, does", _faces(forward.target, answer[chosen].numpy(), SHEET_SIZE)),
+    ]
+    if has_truth:
+        rows.append((f"{forward.target.name}, should", _faces(forward.target, right[chosen].numpy(), SHEET_SIZE)))
+    titles = [
+        {
+            "index": names[k],
+            "title": names[k],
+            "subtitle": f"misses {_percent(float(wrong[k]))}" if has_truth else "at 1",
+        }
+        for k in chosen.tolist()
+    ]
+    return {
+        "frames": titles,
+        "rows": [{"title": title, "pictures": [_picture(face) for face in faces]} for title, faces in rows],
+    }
+
+
+@torch.no_grad()
+def _heat(target: Rig, arrays: dict[str, np.ndarray]) -> dict[str, Any] | None:
+    """Mean distance of each vertex from where it should be, on the face, beside how far it should move; None without
+    a truth."""
+    if "truth" not in arrays:
+        return None
+    predicted = torch.from_numpy(arrays["truth_predicted"]).float()
+    truth = torch.from_numpy(arrays["truth"]).float()
+    flat = target.deltas.flatten(1)
+
+    def distances(weights: Tensor) -> Tensor:
+        total = sum((part @ flat).unflatten(-1, (-1, 3)).norm(dim=-1).sum(0) for part in weights.split(16))
+        return 1000 * total / len(weights)  # (V,) millimetres
+
+    error, motion = distances(predicted - truth), distances(truth)
+    seen = (Portrait.of(target).project(target.neutral, 2) - 1).abs().amax(-1) < 1
+    middle = target.neutral[seen].mean(0)  # of what the picture shows: it is turned about that
+    angle = torch.tensor(0.65)
+    turn = torch.tensor([[angle.cos(), 0, angle.sin()], [0, 1, 0], [-angle.sin(), 0, angle.cos()]])
+    shown = []
+    for title, values in (("How far off it is", error), ("How far it should move", motion)):
+        limit = float(torch.quantile(values, 0.995)) or 1.0
+        colors = torch.from_numpy(_colored(values.numpy(), limit, _HEAT)).float() / 255
+        painted = Portrait.of(replace(target, colors=colors, texture=None))
+        views = (target.neutral, (target.neutral - middle) @ turn.T + middle)
+        faces = [_bytes(painted.render(vertices[None], HEAT_SIZE)["color"])[0] for vertices in views]
+        shown.append({"title": title, "limit": limit, "pictures": [_picture(face) for face in faces]})
+    return {
+        "shown": shown,
+        "legend": _picture(_colored(np.linspace(0, 1, 256)[None].repeat(4, 0), 1.0, _HEAT), "PNG"),
+        "sentence": f"Where it is worst it is {shown[0]['limit']:.2f} mm off; where it moves most it should move "
+        f"{shown[1]['limit']:.2f} mm. Read the two scales.",
+    }
 
 
 # Curves --------------------------------------------------------------------------------------------------------------
@@ -478,6 +720,32 @@ def _curves(target: Rig, arrays: dict[str, np.ndarray], span: np.ndarray, count:
             }
         )
     return curves
+
+
+def _every_curve(target: Rig, arrays: dict[str, np.ndarray], result: dict[str, Any]) -> dict[str, Any]:
+    """All weights of all frames in steps of 1/255, for the page to draw whichever is asked for."""
+
+    def packed(weights: np.ndarray) -> str:
+        return base64.b64encode((np.clip(weights, 0, 1).T * 255).round().astype(np.uint8).tobytes()).decode()
+
+    lines = {"truth": arrays["truth"]} if "truth" in arrays else {}
+    lines |= {"predicted": arrays["predicted"]}
+    lines |= {name.removeprefix("method "): arrays[name] for name in arrays if name.startswith("method ")}
+    kind = arrays["kind"]
+    starts = [0, *(np.flatnonzero(np.diff(kind)) + 1).tolist()]
+    notes = {
+        each["name"]: f"mean error {each['mae']:.3f}, correlation {each['correlation']:.2f}, gain {each['gain']:.2f}"
+        for each in result["shapes"]
+        if each["moves"]
+    }
+    return {
+        "names": list(target.names),
+        "count": len(kind),
+        "first": int(lines.get("truth", arrays["predicted"]).std(0).argmax()),
+        "kinds": [[start, _KIND_TITLES[KINDS[kind[start]]]] for start in starts],
+        "lines": [[name, packed(weights)] for name, weights in lines.items()],
+        "notes": notes,
+    }
 
 
 def _training(path: Path) -> list[dict[str, Any]]:

@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
+from reenact import tensorboard
 from reenact.atomic import write_atomically
 from reenact.checkpoint import (
     RunLock,
@@ -128,6 +130,8 @@ def train(config: Config, resume: bool = False) -> Path:
         KeyboardInterrupt: Ctrl-C; everything up to the last finished step was saved.
         SystemExit: SIGTERM or a lost terminal, likewise saved; status 143 or 129.
     """
+    if config.training.tensorboard:
+        tensorboard.require()
     console = Console(file=_Output(), markup=False, highlight=False, emoji=False)  # a folder may look like markup
     with _interrupts() as interrupts:
         # Already for the layout, which sums of several threads would end in other bits from time to time.
@@ -159,10 +163,12 @@ def _train(run: Run, resume: bool, lock: RunLock, interrupts: _Interrupts, conso
         with console.status("Finding what varies in each rig's pictures"):
             networks.fit({key: studio.show(studio.survey(count)) for key, studio in studios.items()})
     done = sum(stage.steps for stage in stages[:stage_index])
-    with _progress(console) as show, interrupts.patiently():
+    board = tensorboard.Board(run.folder, config.training.tensorboard, done + first)
+    with _progress(console) as show, interrupts.patiently(), board:
         for index, stage in list(enumerate(stages))[stage_index:]:
             optimizer = optimizer or _optimizer(config, stage)
-            log, pools, saved = _Log(run.folder / "metrics.jsonl", stage.name, first), None, first
+            log = _Log(run.folder / "metrics.jsonl", stage.name, first, partial(board.scalars, stage.name, done))
+            pools, saved = None, first
             networks.train()
             for step in range(first, stage.steps):
                 seed = [config.training.seed, index, step]
@@ -201,7 +207,7 @@ def _train(run: Run, resume: bool, lock: RunLock, interrupts: _Interrupts, conso
                     _save(run, lock, networks, optimizer, index, step + 1, done + step + 1)
                     saved = step + 1
                     if not interrupts.asked:
-                        _preview(run, networks, studios, index, done + step + 1, console)
+                        _preview(run, networks, studios, index, done + step + 1, console, board)
                 if interrupts.asked:
                     _say_stopped(console, run)
                     raise interrupts.asked
@@ -595,8 +601,11 @@ def _restore(run: Run, networks: Networks, stages: list[_Stage]) -> tuple[int, i
 class _Log:
     """Means of the losses, appended to a JSONL file; lines of steps that will be taken again are dropped first."""
 
-    def __init__(self, path: Path, stage: str, step: int):
-        self.path, self.stage = path, stage
+    def __init__(
+        self, path: Path, stage: str, step: int, tell: Callable[[int, dict[str, float]], None] = lambda *_: None
+    ):
+        """`tell` hears of each line as well."""
+        self.path, self.stage, self.tell = path, stage, tell
         self.pending: dict[str, list[float]] = {}
         self.recent: dict[str, float] = {}
         self.started, self.step, self.last = time.perf_counter(), step, step
@@ -618,27 +627,31 @@ class _Log:
         now = time.perf_counter()
         self.recent = {name: float(np.mean(values)) for name, values in self.pending.items()}
         speed = (self.step - self.last) / (now - self.started)
-        line = {
-            "stage": self.stage,
-            "step": self.step,
-            "loss": sum(self.recent.values()),
-            **self.recent,
-            "steps_per_second": speed,
-        }
+        numbers = {"loss": sum(self.recent.values()), **self.recent, "steps_per_second": speed}
+        line = {"stage": self.stage, "step": self.step, **numbers}
+        self.tell(self.step, numbers)
         with self.path.open("a") as file:
             file.write(json.dumps(line) + "\n")
         self.pending, self.started, self.last = {}, now, self.step
 
 
 def _preview(
-    run: Run, networks: Networks, studios: dict[str, Studio], stage: int, total: int, console: Console
+    run: Run,
+    networks: Networks,
+    studios: dict[str, Studio],
+    stage: int,
+    total: int,
+    console: Console,
+    board: tensorboard.Board,
 ) -> None:
     """A failing preview never stops training."""
     try:
         together = run.config.training.together
         trained = [key for index, key in enumerate(studios) if together or index + 1 <= stage]
         networks.eval()
-        save_preview(run.folder / "previews" / f"{total:06d}.png", studios, networks, trained)
+        path = run.folder / "previews" / f"{total:06d}.png"
+        save_preview(path, studios, networks, trained)
+        board.picture(path, total)
     except Exception as error:
         console.print(f"preview skipped: {error}", soft_wrap=True)
     finally:

@@ -14,6 +14,7 @@ from skimage.metrics import structural_similarity
 
 from reenact import evaluation
 from reenact.errors import ReenactError
+from reenact.retargeting.correspondence import Correspondence, Places
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
@@ -512,3 +513,18 @@ def test_evaluate_writes_what_it_returns(rigs, monkeypatch, tmp_path):
     assert stages[0] == "loading the networks"
     with pytest.raises(ReenactError, match="at least 18 frames"):
         evaluation.evaluate(tmp_path, frames=5)
+
+
+def test_an_unknown_method_is_refused_before_anything_is_loaded(tmp_path):
+    with pytest.raises(ReenactError, match=r"expected methods among neutral, copy, .*, got magic"):
+        evaluation.evaluate(tmp_path, methods=("copy", "magic"))
+
+
+def test_a_method_takes_the_correspondence_that_the_run_found():
+    found = Correspondence(Places.at(torch.arange(8)), Places.at(torch.arange(8, 16)), torch.ones(8))
+    run = types.SimpleNamespace(correspondences={("a", "b"): found})
+    forward, back = (types.SimpleNamespace(run=run, keys=keys) for keys in (("a", "b"), ("b", "a")))
+    assert evaluation._correspondence(forward, "copy") is None
+    assert evaluation._correspondence(forward, "rbf") is found
+    reversed_ = evaluation._correspondence(back, "rbf")
+    assert (reversed_.source, reversed_.target) == (found.target, found.source)

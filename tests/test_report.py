@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 
 import numpy as np
@@ -13,6 +14,7 @@ from PIL import Image
 
 from reenact import evaluation, report
 from reenact.errors import ReenactError
+from reenact.retargeting import METHODS
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
@@ -73,10 +75,11 @@ class Halved:
         return None
 
 
-def make_run(folder, source, target, frames=36):
+def make_run(folder, source, target, frames=36, methods=()):
     """An evaluated run folder and its numbers."""
     forward, reverse = Halved(source, target), Halved(target, source)
-    numbers, arrays = evaluation.evaluate_retargeters(forward, reverse, frames, 0)
+    beside = {name: METHODS[name](source, target) for name in methods}
+    numbers, arrays = evaluation.evaluate_retargeters(forward, reverse, frames, 0, methods=beside)
     (folder / "evaluation").mkdir(parents=True)
     np.savez_compressed(folder / "evaluation" / "frames.npz", **arrays)
     (folder / "evaluation" / "metrics.json").write_text(json.dumps(evaluation.finite(numbers)))
@@ -115,13 +118,13 @@ class Links(HTMLParser):
         self.tags.append(tag)
         self.addresses += [value for key, value in attrs if key in ("src", "srcset", "data", "poster") and value]
         self.addresses += [value for key, value in attrs if key == "href" and tag == "link"]
-        if tag not in ("meta", "img", "input", "br", "line", "polyline", "path"):
+        if tag not in ("meta", "img", "input", "br", "line", "polyline", "path", "rect"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
         if self.open and self.open[-1] == tag:
             self.open.pop()
-        elif tag not in ("path", "line", "polyline"):
+        elif tag not in ("path", "line", "polyline", "rect"):
             raise AssertionError(f"</{tag}> closes <{self.open[-1]}>")
 
 
@@ -158,7 +161,7 @@ def test_the_page_has_player_sheets_curves_maps_and_training(page):
     assert page.count("Weight of ") >= 4
     assert "Training loss of reenactnet" in page
     assert page.count("Error map: ") == 4
-    assert page.count('class="sheet"') == 2
+    assert page.count('class="sheet"') == 3  # worst frames, from bad to good, single shapes
 
 
 def test_the_player_knows_each_frame_of_its_sheet(page):
@@ -166,6 +169,168 @@ def test_the_player_knows_each_frame_of_its_sheet(page):
     assert data["count"] == len(data["frames"]) == len(data["labels"]) == len(data["positions"])
     assert max(data["positions"]) < data["length"]
     assert data["frames"] == sorted(set(data["frames"]))
+
+
+def test_each_shape_alone_stands_beside_what_it_should_do(page, run):
+    alone = report._alone(run[1])
+    assert alone["matrix"]["rows"] == list(NAMES)
+    assert [(cell["x"], cell["y"], cell["does"], cell["should"]) for cell in alone["matrix"]["cells"]] == [
+        (k, k, 0.5, True) for k in range(len(NAMES))
+    ]
+    assert "Of 6 shapes whose right answer is known, 6 move the right shape most" in page
+    assert "The median misses 50 % of its motion" in page
+    assert "jawOpen → jawOpen 0.50, should be 1.00" in page
+
+
+def test_a_shape_that_moves_another_is_named():
+    class Swapped(Halved):
+        """Both smiles are answered by the left one."""
+
+        def __call__(self, clip):
+            weights = clip.weights.clone()
+            weights[:, 3] += weights[:, 4]
+            weights[:, 4] = 0
+            return Clip(self.target.names, weights.clamp(0, 1), clip.fps)
+
+    alone = report._alone(Swapped(make_head("source"), make_head("target")))
+    assert "5 move the right shape most" in alone["sentence"]
+    assert "the worst is mouthSmileRight" in alone["sentence"]
+    assert "moves mouthSmileLeft by 1.00" in alone["sentence"]
+    stray = next(cell for cell in alone["matrix"]["cells"] if not cell["should"])
+    assert (alone["matrix"]["rows"][stray["y"]], alone["matrix"]["columns"][stray["x"]]) == NAMES[4:2:-1]
+    assert alone["sheet"]["frames"][0]["title"] == "mouthSmileRight"
+
+
+def test_a_corrective_is_asked_with_its_base():
+    heads = [make_head(name, ("jawOpen", "eyeBlinkLeft", "eyeBlinkRight", "mouthClose")) for name in ("one", "two")]
+    assert report._alone(Halved(*heads))["matrix"]["rows"][-1] == "mouthClose + jawOpen"
+
+
+def test_error_lies_on_the_face_in_millimetres():
+    head = make_head("target")
+    truth = torch.eye(6).numpy()
+    heat = report._heat(head, {"truth": truth, "truth_predicted": 0.5 * truth})
+    moved = 1000 * head.deltas.norm(dim=-1).mean(0)  # of each shape alone, and so of the six frames
+    error, motion = heat["shown"]
+    assert motion["limit"] == pytest.approx(float(moved.quantile(0.995)), rel=1e-5)
+    assert error["limit"] == pytest.approx(0.5 * motion["limit"], rel=1e-5)
+    assert report._heat(head, {}) is None
+
+
+def test_a_page_of_many_shapes_shows_the_worst(monkeypatch):
+    monkeypatch.setattr(report, "MOST_SHAPES", 4)
+    alone = report._alone(Halved(make_head("source"), make_head("target")))
+    assert (len(alone["matrix"]["rows"]), alone["left_out"]) == (4, 2)
+
+
+def test_methods_stand_beside_the_run_in_numbers_faces_and_curves(tmp_path):
+    forward, numbers = make_run(tmp_path / "run", make_head("a"), make_head("b"), 36, ("copy", "neutral"))
+    assert numbers["methods"]["copy"]["truth"]["ver"] == pytest.approx(0, abs=1e-6)  # the truth is by name
+    assert numbers["methods"]["neutral"]["truth"]["ver"] == pytest.approx(1)
+    page = report.write_report([tmp_path / "run"], [numbers], load=lambda _: forward).read_text()
+    assert Links(page).tags.count("canvas") == 5
+    assert "copy, no network" in page
+    assert "--methods copy neutral" in page
+    curves = json.loads(re.search(r"const CURVES = (.*);", page)[1])[0]
+    assert [name for name, _ in curves["lines"]] == ["truth", "predicted", "copy", "neutral"]
+
+
+def test_the_sentence_on_several_runs_says_whether_the_order_is_sure():
+    def entry(name, ver, low, high):
+        result = {"truth": {"ver": ver, "ver_interval": [low, high]}, "methods": {}}
+        return {"name": name, "source": "a", "target": "b", "result": result}
+
+    sure = report.compared([entry("one", 0.4, 0.3, 0.5), entry("two", 0.1, 0.05, 0.2)])
+    assert sure.startswith(
+        "a → b: two comes closest to the truth (VER 0.10), one follows (0.40); their intervals do not"
+    )
+    assert "overlap" in report.compared([entry("one", 0.4, 0.3, 0.5), entry("two", 0.35, 0.3, 0.41)])
+    unknown = entry("three", None, None, None)
+    assert report.compared([unknown, entry("one", 0.4, 0.3, 0.5)]) == ""
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright, of the extra dev")
+    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if path is None:
+        pytest.skip("needs chromium or google-chrome")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(chromium, tmp_path):
+    """Opens pages, and makes sure that they ask nobody and say nothing."""
+    said, asked, pages = [], [], []
+
+    def open_page(path, **context):
+        page = chromium.new_page(**{"reduced_motion": "reduce"} | context)
+        page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(path.as_uri())
+        page.wait_for_function("[...document.images].every(image => image.complete)")
+        pages.append(page)
+        return page
+
+    yield open_page
+    for page in pages:
+        page.close()
+    assert said == []
+    assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
+
+
+PIXELS = (
+    "canvas => [...canvas.getContext('2d').getImageData(0, 0, 256, 256).data].reduce((a, b) => (a * 31 + b) % 65521)"
+)
+
+
+def test_in_a_browser_the_player_scrubs_and_any_shape_is_drawn(opened, tmp_path):
+    forward, numbers = make_run(tmp_path / "run", make_head("a"), make_head("b"), 36, ("neutral",))
+    page = opened(report.write_report([tmp_path / "run"], [numbers], load=lambda _: forward))
+    canvas, scrubber = page.locator("canvas").nth(1), page.get_by_label("Frame", exact=True)
+    seen = set()
+    for frame in range(3):
+        scrubber.fill(str(frame))
+        seen.add(canvas.evaluate(PIXELS))
+    assert len(seen) == 3
+
+    def drawn(name):
+        return page.locator(f".any polyline[data-name={name}]").get_attribute("points")
+
+    before = drawn("predicted")
+    page.get_by_label("Shape whose curve is drawn").select_option("eyeBlinkLeft")
+    assert drawn("predicted") != before
+    heights = [float(point.split(",")[1]) for point in drawn("predicted").split()]
+    with np.load(tmp_path / "run" / "evaluation" / "frames.npz") as arrays:
+        wanted = 100 - 100 * arrays["predicted"][:, 1]
+    assert np.abs(heights - wanted).max() < 0.3  # steps of 1/255, half of one, in percent; one digit
+    assert "eyeBlinkLeft" in page.locator(".any svg").get_attribute("aria-label")
+
+    hidden = page.locator("figure.hidden")
+    assert hidden.count() == 2
+    page.get_by_label("truth", exact=True).check()
+    assert hidden.count() == 1
+
+
+def test_in_a_browser_runs_of_one_source_play_in_step(run, opened):
+    folder, forward, numbers = run
+    page = opened(report.write_report([folder, folder], [numbers, numbers], load=lambda _: forward))
+    box = page.locator(".player").first
+    box.get_by_label("Frame", exact=True).fill("2")
+    pictures = [canvas.evaluate(PIXELS) for canvas in box.locator("figure:not(.hidden) canvas").all()]
+    assert len(pictures) == 3
+    assert pictures[1] == pictures[2] != pictures[0]  # twice the same run
+
+
+@pytest.mark.parametrize("context", [{"color_scheme": "dark"}, {"viewport": {"width": 360, "height": 640}}])
+def test_in_a_browser_nothing_is_wider_than_the_page(run, page, opened, context):
+    shown = opened(run[0] / "report.html", **context)
+    wide, window = shown.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    assert wide <= window
 
 
 def test_the_same_page_from_the_command_line(run, page, monkeypatch, capsys):
@@ -185,7 +350,7 @@ def test_several_runs_share_a_page_with_their_mean_and_spread(run, tmp_path):
     assert "2 runs compared" in page
     assert "0.40 ± 0.14" in page  # of 0.5 and 0.3
     assert Links(page).open == []
-    assert Links(page).tags.count("canvas") == 6
+    assert Links(page).tags.count("canvas") == 10  # three of each run, and the source, both and the truth in step
 
 
 def test_rigs_without_shared_names_are_judged_by_pictures_alone(tmp_path):

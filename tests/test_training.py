@@ -25,6 +25,7 @@ from reenact.pairs import Pairs, Teacher
 from reenact.rigs.clip import Clip
 from reenact.rigs.motion import expressions
 from reenact.run import Run, networks_state
+from reenact.tensorboard import Board
 from reenact.training import _interrupts, _Log, _Output, _preview, _say_next, _step_count, learning_rate, train
 
 
@@ -302,7 +303,8 @@ def test_nudges_of_other_rigs_are_refused(toy_config, tmp_path):
 
 def test_a_preview_that_fails_does_not_stop_the_training(toy_run, tmp_path):
     said = io.StringIO()
-    _preview(toy_run, toy_run.networks(), {}, 0, 1, Console(file=said))  # no studio to photograph
+    board = Board(tmp_path, wanted=False)
+    _preview(toy_run, toy_run.networks(), {}, 0, 1, Console(file=said), board)  # no studio to photograph
     assert said.getvalue().startswith("preview skipped: ")
 
 

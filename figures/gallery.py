@@ -1,0 +1,171 @@
+"""A page of everything that moves, runs/gallery.html: one file, to look at and to send.
+
+    python figures/gallery.py [RUN ...] [--out FILE.html] [--seconds 4]
+
+One clip on every built-in character, by the networks of a run from anny:man where one is given, else by a geometric
+method; one character by many methods; and every kind of clip that is made by formula.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import io
+import os
+import sys
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch starts: its idle threads would spin on our cores
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import jinja2
+import torch
+from PIL import Image
+from rich.console import Console
+
+from reenact.atomic import write_atomically
+from reenact.inference import ImageRetargeter
+from reenact.portrait import Portrait
+from reenact.retargeting import METHODS, Retargeter
+from reenact.retargeting.correspondence import find_correspondence
+from reenact.rigs import motion
+from reenact.rigs.anny import BUILT_IN
+from reenact.rigs.clip import Clip
+from reenact.rigs.files import load_rig
+from reenact.rigs.rig import Rig
+from reenact.rigs.timeline import resampled
+
+SOURCE, SHOWN = "anny:man", "anny:toon"
+BESIDE = ("shape-matching", "consensus", "delta-transfer", "deformation-transfer", "rbf", "ribera-paper", "copy")
+"""Methods that the second section compares."""
+SIZE, FPS = 192, 12
+
+PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Gallery · Reenact</title><style>
+:root { color-scheme: light dark; --paper: #f6f5f2; --ink: #1b1d22; --soft: #585d68; }
+@media (prefers-color-scheme: dark) { :root { --paper: #14161a; --ink: #eceae5; --soft: #a3a8b3; } }
+body { margin: 0 auto; padding: 1.5rem; max-width: 1120px; background: var(--paper); color: var(--ink);
+  font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; }
+div { display: grid; grid-template-columns: repeat(auto-fill, minmax(150px, 1fr)); gap: 1rem; }
+figure { margin: 0; } img { width: 100%; aspect-ratio: 1; border-radius: 10px; display: block; background: #5c6169; }
+figcaption { font-size: .85rem; color: var(--soft); margin-top: .3rem; } figcaption b { color: var(--ink); }
+h2 { margin: 2.2rem 0 .2rem; } p { margin: 0 0 .8rem; max-width: 74ch; color: var(--soft); }
+</style></head><body>
+<h1>Gallery</h1>
+{% for section in sections %}<h2>{{ section.title }}</h2><p>{{ section.note }}</p>
+<div>{% for face in section.faces %}<figure><picture>
+<source media="(prefers-reduced-motion: reduce)" srcset="{{ face.still }}">
+<img src="{{ face.moving }}" alt="{{ face.title }}, {{ face.note }}"></picture>
+<figcaption><b>{{ face.title }}</b><br>{{ face.note }}</figcaption></figure>{% endfor %}</div>
+{% endfor %}</body></html>
+"""
+
+
+@dataclass(frozen=True)
+class Face:
+    """A face that moves, as a picture in the page."""
+
+    title: str
+    note: str
+    moving: str
+    still: str
+
+
+@torch.no_grad()
+def face(title: str, note: str, rig: Rig, clip: Clip) -> Face:
+    """The clip on the rig as an animated WebP, and its liveliest frame."""
+    portrait, pictures = Portrait.of(rig), []
+    for part in resampled(clip, FPS).weights.float().split(16):
+        drawn = portrait.render(rig.vertices(part), SIZE)["color"].clamp(0, 1)
+        pictures += [Image.fromarray(each) for each in (255 * drawn.movedim(1, -1)).round().byte().numpy()]
+    most = pictures[int(resampled(clip, FPS).weights.sum(1).argmax())]
+    packed, single = io.BytesIO(), io.BytesIO()
+    pictures[0].save(
+        packed, "WEBP", save_all=True, append_images=pictures[1:], duration=round(1000 / FPS), loop=0, quality=70
+    )
+    most.save(single, "WEBP", quality=80)
+    return Face(title, note, *(_uri(each.getvalue()) for each in (packed, single)))
+
+
+def _uri(data: bytes) -> str:
+    return f"data:image/webp;base64,{base64.b64encode(data).decode()}"
+
+
+def everyone(trained: dict[str, ImageRetargeter], clip: Clip, source: Rig, say) -> list[Face]:
+    """The clip on the source, and on every other character."""
+    faces = [face(source.name, "the source", source, clip)]
+    for name in BUILT_IN:
+        if name == SOURCE:
+            continue
+        say(f"{SOURCE} -> {name}")
+        if name in trained:
+            faces.append(face(name, f"networks, {trained[name].run.folder.name}", load_rig(name), trained[name](clip)))
+            continue
+        target = load_rig(name)
+        method = "consensus" if name in ("anny:units", "anny:merged") else "shape-matching"
+        moved = METHODS[method](source, target, find_correspondence(source, target))(clip)
+        faces.append(face(name, method, target, moved))
+    return faces
+
+
+def methods(trained: dict[str, ImageRetargeter], clip: Clip, source: Rig, say) -> list[Face]:
+    """One target by one method after the other."""
+    target = load_rig(SHOWN)
+    found = find_correspondence(source, target)
+    retargeters: dict[str, Retargeter] = {"networks": trained[SHOWN]} if SHOWN in trained else {}
+    faces = [face(source.name, "the source", source, clip)]
+    for name, made in retargeters.items():
+        faces.append(face(name, target.name, target, made(clip)))
+    for name in BESIDE:
+        say(f"{SHOWN}: {name}")
+        faces.append(face(name, target.name, target, METHODS[name](source, target, found)(clip)))
+    return faces
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("runs", nargs="*", type=Path)
+    parser.add_argument("--out", type=Path, default=Path("runs") / "gallery.html")
+    parser.add_argument("--seconds", type=float, default=4.0)
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")  # of shapes without a namesake
+    source = load_rig(SOURCE)
+    trained = {}
+    for folder in arguments.runs:
+        made = ImageRetargeter.load(folder)
+        if made.source.name == SOURCE:
+            trained[made.target.name] = made
+    clip = motion.synthesize(source.names, arguments.seconds, seed=2027, kind="emotion")
+    console = Console(stderr=True)
+    with console.status("") as status:
+        sections = [
+            {
+                "title": "One clip on everyone",
+                "note": "Nobody paired expressions or placed markers.",
+                "faces": everyone(trained, clip, source, status.update),
+            },
+            {
+                "title": "One face, many methods",
+                "note": "By correspondences that are found. Ribera's method to the letter exaggerates.",
+                "faces": methods(trained, clip, source, status.update),
+            },
+            {
+                "title": "Clips by formula",
+                "note": "What trainings and evaluations are made of, each kind with another trap.",
+                "faces": [
+                    face(kind, SOURCE, source, motion.synthesize(source.names, arguments.seconds, seed=3, kind=kind))
+                    for kind in motion.KINDS
+                ],
+            },
+        ]
+    page = jinja2.Environment(autoescape=True).from_string(PAGE).render(sections=sections)
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(arguments.out, page.encode())
+    print(arguments.out)
+
+
+if __name__ == "__main__":
+    main()
