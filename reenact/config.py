@@ -57,9 +57,8 @@ class PairsConfig:
 
     method: Literal["geometry", "pictures", "none"] = "geometry"
     """`geometry` finds places of the two surfaces that belong together and lets geometric methods label expressions,
-    with the help of pictures (of rigs of more than 50,000 vertices, pictures alone); `pictures` compares the motion
-    passes of single shapes, and needs no meshes beyond the renderer; `none` leaves the networks to what they share by
-    themselves."""
+    with the help of pictures; `pictures` compares the motion passes of single shapes, and needs no meshes beyond the
+    renderer; `none` leaves the networks to what they share by themselves."""
     correspondence: str | None = None
     """A file of pairs of places, source and target; None finds them."""
     markers: int = 300

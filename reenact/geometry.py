@@ -132,11 +132,9 @@ def farthest_points(
         chosen = [int((scale * _distances(places, np.average(places, axis=0, weights=scale))).argmax())]
     else:
         chosen = [int(np.searchsorted(weighty, first))]
-    priority = scale * _distances(places, places[chosen[0]])
+    priority = np.full(len(places), np.inf)
     for _ in range(count - 1):
-        priority[chosen[-1]] = -1.0  # Never chosen again, even where several coincide.
-        chosen.append(int(priority.argmax()))
-        priority = np.minimum(priority, scale * _distances(places, places[chosen[-1]]))
+        chosen.append(_next_farthest(places, scale, priority, chosen[-1]))
     return torch.from_numpy(weighty[chosen]).to(points.device)
 
 
@@ -245,6 +243,23 @@ _LEAF = 8
 def _compiled(function):
     # An import hook that checks types, as in our tests, wraps every function; the compiler needs the bare one.
     return numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
+
+
+@_compiled
+def _next_farthest(places, scale, priority, last):
+    """The index of the highest priority, once the last chosen point has lowered those around it, in place.
+
+    A chosen point has -1: it is never chosen again, even where several coincide.
+    """
+    priority[last] = -1.0
+    best, highest = 0, -np.inf
+    for n in range(len(places)):
+        if priority[n] >= 0:
+            x, y, z = places[n, 0] - places[last, 0], places[n, 1] - places[last, 1], places[n, 2] - places[last, 2]
+            priority[n] = min(priority[n], scale[n] * np.sqrt(x * x + y * y + z * z))
+        if priority[n] > highest:
+            best, highest = n, priority[n]
+    return best
 
 
 @_compiled

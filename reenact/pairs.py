@@ -162,8 +162,8 @@ def find_teacher(
         geometry = Labels(source.rig, target.rig, correspondence, likeness)
     if pictures is None and geometry is None:
         raise ReenactError(
-            f"{source.rig.name} to {target.rig.name}: expected a correspondence, or images.motion, to learn from; the "
-            'surfaces are too large to register: give pairs.correspondence, or set pairs.method to "none"'
+            f"{source.rig.name} to {target.rig.name}: expected a correspondence, or images.motion, to learn from; "
+            'give pairs.correspondence, or set pairs.method to "none"'
         )
     if corrected is None or not len(corrected[0]):
         return Teacher(pictures, geometry)

@@ -49,9 +49,6 @@ from reenact.rigs.rig import Rig
 
 _LAYOUT_RESOLUTION = 64
 """Pixels at which layouts are found; a studio enlarges them to the resolution of its pictures."""
-MOST_VERTICES = 50_000
-"""Of rigs whose surfaces are registered, unless pairs are given. With 100,000 a quarter of an hour was not enough.
-Beyond, pictures teach alone."""
 _TAUGHT = "taught.json"
 """Corrections that the networks learn from, in the run folder; nudges.json there is the viewer's."""
 _FILE = re.compile(r"(\d+)-(.+)\.npz")
@@ -300,11 +297,8 @@ def _usable_nudges(path: str, rigs: dict[str, Rig]) -> Nudges:
 
 
 def _registered(rigs: dict[str, Rig], config: Config) -> list[tuple[str, str]]:
-    """Keys of the pairs of rigs that have a correspondence; one that is given is always taken."""
-    if config.pairs.method != "geometry":
-        return []
-    small = [key for key, rig in rigs.items() if len(rig.neutral) <= MOST_VERTICES]
-    return list(itertools.combinations(rigs if config.pairs.correspondence is not None else small, 2))
+    """Keys of the pairs of rigs that have a correspondence."""
+    return list(itertools.combinations(rigs, 2)) if config.pairs.method == "geometry" else []
 
 
 def _pair_file(keys: list[str], first: str, second: str) -> str:

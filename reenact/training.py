@@ -49,7 +49,7 @@ from reenact.losses import VertexDistance, code_distance, weight_distance
 from reenact.models import Networks
 from reenact.pairs import Teacher
 from reenact.preview import save_preview
-from reenact.run import MOST_VERTICES, Run, restore_networks
+from reenact.run import Run, restore_networks
 
 _PICTURES_PER_COMPONENT = 6
 """Pictures of each rig, per principal component, from which networks learn what varies before any training."""
@@ -238,12 +238,6 @@ def _find_teachers(run: Run, studios: dict[str, Studio], console: Console) -> di
     if run.config.pairs.method == "none":
         return {}
     teachers, words = {}, {}
-    if run.config.pairs.method == "geometry" and not run.correspondences:
-        console.print(
-            f"A rig has more than {MOST_VERTICES:,} vertices, too many to register: pictures alone tell which shapes "
-            "are one; give pairs of places with --pairs.correspondence for more",
-            soft_wrap=True,
-        )
     for source in studios:
         for target in studios:
             if source == target:

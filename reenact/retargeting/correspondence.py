@@ -14,9 +14,13 @@ from torch import Tensor
 from reenact.errors import ReenactError
 from reenact.geometry import farthest_points
 from reenact.retargeting import registration
+from reenact.retargeting.thinning import thinned
 from reenact.rigs.formats import disk, npz, table
 from reenact.rigs.rig import Rig
 
+MOST_VERTICES = 30_000
+"""Of surfaces that are registered; larger ones are thinned. Registration of 100,000 takes more than a quarter of an
+hour, and a face that moves is told well enough by a tenth."""
 MARKERS = 99
 """Pairs that are sampled unless said otherwise, as many as the published captures have markers."""
 
@@ -46,6 +50,10 @@ class Places:
 
     def __getitem__(self, chosen: Int[Tensor, "M"]) -> Places:
         return Places(self.corners[chosen], self.shares[chosen])
+
+    def among(self, vertices: Int[Tensor, "N"]) -> Places:
+        """The same places, where the rig's vertices are these of a larger rig."""
+        return Places(vertices[self.corners], self.shares)
 
 
 @dataclass(frozen=True)
@@ -135,7 +143,8 @@ def find_correspondence(
     Args:
         source: Whose vertices are paired.
         target: On whose surface their partners lie; any topology.
-        count: Pairs, see `Correspondence.sample`; None for all vertices of the face that the source's shapes move.
+        count: Pairs, see `Correspondence.sample`; None for all vertices of the face that the source's shapes move, of
+            rigs of more than `MOST_VERTICES` those that `thinned` keeps.
         use_names: Whether names may tell which shapes of both rigs are the same. Where they do not, motion does.
 
     Returns:
@@ -145,8 +154,9 @@ def find_correspondence(
     Raises:
         ReenactError: A rig does not move, or no four shapes of both move the face alike.
     """
-    found = registration.register(source, target, use_names)
-    dense = _correspondence(found)
+    (ours, our_vertices), (theirs, their_vertices) = (thinned(rig, MOST_VERTICES) for rig in (source, target))
+    found = _correspondence(registration.register(ours, theirs, use_names))
+    dense = Correspondence(found.source.among(our_vertices), found.target.among(their_vertices), found.confidence)
     return dense if count is None else dense.sample(source, count)
 
 
