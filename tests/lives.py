@@ -4,6 +4,7 @@
 Everything is imported and compiled once; each life is a fork of this process: half a second instead of five.
 """
 
+import ctypes
 import json
 import os
 import random
@@ -73,6 +74,10 @@ def born(run: Path, config: Config, before=lambda: None) -> int:
         os.dup2(quiet, 2)
         sys.stdout, sys.stderr = (os.fdopen(number, "w", closefd=False) for number in (1, 2))
         status = 99
+        for number in (signal.SIGINT, signal.SIGHUP):  # a shell or nohup may have told us to ignore them
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+        with suppress(AttributeError):  # none may outlive this process: PR_SET_PDEATHSIG, where there is one
+            ctypes.CDLL(None).prctl(1, signal.SIGKILL)
         try:
             before()
             status = live(run, config)
@@ -194,7 +199,7 @@ def signals(folder: Path, seed: int, name: str, count: int, where: str) -> dict:
     found = {"seconds": [], "statuses": [], "wrong": []}
     for index in range(count):
         run = folder / f"{where}-{index}"
-        child = born(run, config, lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+        child = born(run, config)
         deadline = time.monotonic() + 120
         log = run / "metrics.jsonl"
         sign = {"steps": log, "again": log, "rendering": run / "pairs.json", "before": folder / "ball.npz"}[where]
