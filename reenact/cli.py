@@ -458,7 +458,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 args=arguments,
             )
         except KeyboardInterrupt:
-            _say(console, "red", "stopped", "by the keyboard")
+            with suppress(KeyboardInterrupt):  # who is impatient presses it twice
+                _say(console, "red", "stopped", "by the keyboard")
             return 130
         except ReenactError as error:
             _say(console, "red", "error", str(error))
