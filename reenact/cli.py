@@ -466,7 +466,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 args=arguments,
             )
         except KeyboardInterrupt:
-            _say(console, "red", "stopped", "by the keyboard")
+            with suppress(KeyboardInterrupt):  # who is impatient presses it twice
+                _say(console, "red", "stopped", "by the keyboard")
             return 130
         except ReenactError as error:
             _say(console, "red", "error", str(error))
@@ -585,8 +586,9 @@ def _geometric(
 ) -> tuple[Clip, Any, list[str]]:
     """A clip moved by a geometric method, the retargeter, and where the two rigs came from."""
     from reenact.retargeting import METHODS
-    from reenact.retargeting.correspondence import find_correspondence, load_correspondence
+    from reenact.retargeting.correspondence import load_correspondence
     from reenact.rigs.files import load_clip, load_rig
+    from reenact.run import Run, register
 
     rigs: list[Rig] = []
     if method not in METHODS:
@@ -594,9 +596,6 @@ def _geometric(
     if len(inputs) == 2:
         if source is not None or target is not None:
             raise ReenactError("infer: expected either a RUN or --source and --target, got both")
-        _run_config(inputs[0])
-        from reenact.run import Run
-
         run = Run.open(inputs[0])
         source, target, rigs = run.config.source, run.config.target, list(run.rigs.values())[:2]
     if len(inputs) not in (1, 2) or target is None:
@@ -614,7 +613,7 @@ def _geometric(
     found = None
     if method not in ("copy", "neutral"):
         with console.status("Finding the correspondence"):
-            found = find_correspondence(*rigs, 300) if pairs is None else load_correspondence(pairs, *rigs)
+            found = register(*rigs, 300) if pairs is None else load_correspondence(pairs, *rigs)
     with console.status(f"Preparing {method}"):
         shown = None if training is None else load_clip(training, rigs[0])
         retargeter = METHODS[method](*rigs, found, shown)

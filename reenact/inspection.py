@@ -187,6 +187,10 @@ def _mesh_problems(rig: Rig) -> list[str]:
     flat = int((area <= 1e-10 * float(area.max().clamp_min(1e-30))).sum())
     if flat:
         problems.append(f"{flat} of {len(rig.faces)} faces have no area; they are drawn as nothing")
+    around = corners - rig.neutral.mean(0)
+    volume = float((around[:, 0] * torch.linalg.cross(around[:, 1], around[:, 2])).sum() / 6)
+    if volume < -0.1 * float((rig.neutral.amax(0) - rig.neutral.amin(0)).prod()):  # an open head has volume enough
+        problems.append("the surface is inside out: its faces are clockwise from outside; flip their normals")
     loose = len(rig.neutral) - len(rig.faces.unique())
     if loose:
         problems.append(f"{loose} of {len(rig.neutral)} vertices belong to no face")
@@ -201,7 +205,7 @@ def _mesh_problems(rig: Rig) -> list[str]:
 
 
 def _shapes(rig: Rig, eyes: Tensor, mouth: Tensor, face: float | None) -> list[ShapeFacts]:
-    unit = face or float((rig.neutral.amax(0) - rig.neutral.amin(0)).max()) / 3
+    unit = face or max(float((rig.neutral.amax(0) - rig.neutral.amin(0)).max()) / 3, 1e-12)
     motion = rig.deltas.norm(dim=-1)  # (K, V)
     largest = motion.amax(1)  # (K,)
     typical = float(largest[largest > 0].median()) if bool((largest > 0).any()) else 0.0

@@ -197,7 +197,8 @@ def face_lines(rig: Rig) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     around the mouth. Shapes that move the whole body say nothing about the face.
 
     Raises:
-        ReenactError: Eyes or mouth have no part and no name, and fewer than two shapes move anything.
+        ReenactError: Eyes or mouth have no part and no name, and fewer than two shapes move anything, or all of them at
+            one place.
     """
     motion = rig.deltas.norm(dim=-1)  # (K, V)
     local = _local(rig, motion)
@@ -209,7 +210,7 @@ def face_lines(rig: Rig) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     if mouth is None:
         mouth = _named_middle(rig, motion, known, local, _MOUTH_SHAPES, _MOUTH_WORDS)
     if eyes is not None and mouth is not None:
-        return eyes, mouth
+        return _apart(rig, eyes, mouth)
     heights = (motion * rig.neutral[:, 1]).sum(1) / motion.sum(1).clamp_min(1e-12)  # (K,)
     if int(local.sum()) < 2:
         raise ReenactError(
@@ -221,7 +222,16 @@ def face_lines(rig: Rig) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     split = border[ordered.diff().argmax()]
     upper, lower = local & (heights > split), local & (heights <= split)
     eyes = _motion_middle(rig, motion[upper].sum(0)) if eyes is None else eyes
-    return eyes, _motion_middle(rig, motion[lower].sum(0)) if mouth is None else mouth
+    return _apart(rig, eyes, _motion_middle(rig, motion[lower].sum(0)) if mouth is None else mouth)
+
+
+def _apart(rig: Rig, eyes: Tensor, mouth: Tensor) -> tuple[Tensor, Tensor]:
+    if not float((eyes - mouth).norm()) > 0:  # nor where one of them was not found
+        raise ReenactError(
+            f"{rig.name}: expected shapes that move eyes, and others that move a mouth, got all at one place; "
+            "check the names of the shapes and the mesh"
+        )
+    return eyes, mouth
 
 
 def _local(rig: Rig, motion: Float[Tensor, "K V"]) -> Bool[Tensor, "K"]:

@@ -24,6 +24,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -592,6 +593,16 @@ def _restore(run: Run, networks: Networks, stages: list[_Stage]) -> tuple[int, i
     return stage, step, optimizer
 
 
+def _parsed(text: str) -> dict[str, Any] | None:
+    """A line of metrics.jsonl, or None where a power cut or a full disk tore it."""
+    try:
+        line = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    whole = isinstance(line, dict) and isinstance(line.get("stage"), str) and type(line.get("step")) is int
+    return line if whole else None
+
+
 class _Log:
     """Means of the losses, appended to a JSONL file; lines of steps that will be taken again are dropped first."""
 
@@ -604,7 +615,7 @@ class _Log:
         self.recent: dict[str, float] = {}
         self.started, self.step, self.last = time.perf_counter(), step, step
         if path.exists():
-            lines = [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
+            lines = [line for text in path.read_text(errors="replace").splitlines() if (line := _parsed(text))]
             kept = [line for line in lines if line["stage"] != stage or line["step"] <= step]
             write_atomically(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
 

@@ -315,7 +315,9 @@ def test_the_commands_to_go_on_with_can_be_pasted(toy_run):
 
 
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_a_signal_asks_once_and_a_second_interrupt_stops_at_once(number, status):
+def test_a_signal_asks_once_and_a_second_interrupt_stops_at_once(number, status, request):
+    inherited = signal.signal(number, signal.SIG_DFL)  # ignored where the tests run under nohup
+    request.addfinalizer(lambda: signal.signal(number, inherited))
     before = signal.getsignal(signal.SIGINT)  # ignored where a shell started the tests in the background
     with _interrupts() as interrupts:
         with interrupts.patiently():
