@@ -1,9 +1,10 @@
 """A page of everything that moves, runs/gallery.html: one file, to look at and to send.
 
-    python figures/gallery.py [RUN ...] [--out FILE.html] [--seconds 4]
+    python figures/gallery.py [RUN ...] [--out FILE.html] [--seconds 4] [--strip docs/images/everyone.webp]
 
 One clip on every built-in character, by the networks of a run from anny:man where one is given, else by a geometric
-method; one character by many methods; and every kind of clip that is made by formula.
+method; one character by many methods; and every kind of clip that is made by formula. The strip is the first of these
+in one picture, for README.md.
 """
 
 from __future__ import annotations
@@ -72,6 +73,7 @@ class Face:
     note: str
     moving: str
     still: str
+    frames: tuple[Image.Image, ...]
 
 
 @torch.no_grad()
@@ -82,12 +84,28 @@ def face(title: str, note: str, rig: Rig, clip: Clip) -> Face:
         drawn = portrait.render(rig.vertices(part), SIZE)["color"].clamp(0, 1)
         pictures += [Image.fromarray(each) for each in (255 * drawn.movedim(1, -1)).round().byte().numpy()]
     most = pictures[int(resampled(clip, FPS).weights.sum(1).argmax())]
-    packed, single = io.BytesIO(), io.BytesIO()
+    single = io.BytesIO()
+    most.save(single, "WEBP", quality=80)
+    return Face(title, note, _uri(_moving(pictures)), _uri(single.getvalue()), tuple(pictures))
+
+
+def _moving(pictures: list[Image.Image]) -> bytes:
+    packed = io.BytesIO()
     pictures[0].save(
         packed, "WEBP", save_all=True, append_images=pictures[1:], duration=round(1000 / FPS), loop=0, quality=70
     )
-    most.save(single, "WEBP", quality=80)
-    return Face(title, note, *(_uri(each.getvalue()) for each in (packed, single)))
+    return packed.getvalue()
+
+
+def strip(faces: list[Face], size: int = 140) -> bytes:
+    """The faces side by side, in step."""
+    wholes = []
+    for moment in zip(*(each.frames for each in faces), strict=True):
+        whole = Image.new("RGB", (size * len(faces), size))
+        for place, picture in enumerate(moment):
+            whole.paste(picture.resize((size, size), Image.Resampling.LANCZOS), (place * size, 0))
+        wholes.append(whole)
+    return _moving(wholes)
 
 
 def _uri(data: bytes) -> str:
@@ -130,6 +148,7 @@ def main() -> None:
     parser.add_argument("runs", nargs="*", type=Path)
     parser.add_argument("--out", type=Path, default=Path("runs") / "gallery.html")
     parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--strip", type=Path)
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")  # of shapes without a namesake
     source = load_rig(SOURCE)
@@ -138,14 +157,17 @@ def main() -> None:
         made = ImageRetargeter.load(folder)
         if made.source.name == SOURCE:
             trained[made.target.name] = made
-    clip = motion.synthesize(source.names, arguments.seconds, seed=2027, kind="emotion")
+    clip = motion.synthesize(source.names, arguments.seconds, seed=2027, kind="mixed")
     console = Console(stderr=True)
     with console.status("") as status:
+        shown = everyone(trained, clip, source, status.update)
+        if arguments.strip is not None:
+            write_atomically(arguments.strip, strip(shown))
         sections = [
             {
                 "title": "One clip on everyone",
                 "note": "Nobody paired expressions or placed markers.",
-                "faces": everyone(trained, clip, source, status.update),
+                "faces": shown,
             },
             {
                 "title": "One face, many methods",

@@ -123,16 +123,18 @@ def infer(
         _run_config(inputs[0])
         from reenact.inference import ImageRetargeter
 
-        retargeter: Any = ImageRetargeter.load(inputs[0], reverse=reverse)
+        with _busy("Loading the networks"):
+            retargeter: Any = ImageRetargeter.load(inputs[0], reverse=reverse)
         names = [retargeter.run.config.source, retargeter.run.config.target][:: -1 if reverse else 1]
-        moved = _moved(retargeter, inputs[-1])
+        moved = _moved_by_networks(retargeter, inputs[-1])
     else:
         moved, retargeter, names = _geometric(inputs, method, source, target, correspondence, training, reverse)
     from reenact.postprocessing import postprocess
     from reenact.rigs.files import save_clip
 
     moved = postprocess(_at_rate(moved, fps), post)
-    save_clip(moved, out, retargeter.target, names[1] if Path(names[1]).is_file() else None)
+    with _busy(f"Writing {out}"):
+        save_clip(moved, out, retargeter.target, names[1] if Path(names[1]).is_file() else None)
     print(f"{out}: {len(moved)} frames, {moved.duration:.1f} s, {retargeter.source.name} -> {retargeter.target.name}")
 
 
@@ -315,10 +317,12 @@ def convert(
     _check_out(output, _CLIP_FILES)
     if rig is None and (input.startswith("synthetic:") or output.suffix.lower() in (".glb", ".vrm", *_USD_FILES)):
         raise ReenactError(f"{input}: expected --rig beside this clip, got none; name the rig that it moves")
-    moved = None if rig is None else load_rig(rig, choice)
-    clip = read_clip(input) if moved is None else load_clip(input, moved)
+    with _busy(f"Reading {input}"):
+        moved = None if rig is None else load_rig(rig, choice)
+        clip = read_clip(input) if moved is None else load_clip(input, moved)
     clip = postprocess(_at_rate(clip, fps), post)
-    save_clip(clip, output, moved, rig)
+    with _busy(f"Writing {output}"):
+        save_clip(clip, output, moved, rig)
     print(f"{output}: {len(clip)} frames, {clip.duration:.1f} s, {len(clip.names)} blendshapes")
 
 
@@ -355,8 +359,9 @@ def inspect(
     from reenact.rigs.files import read_rig
     from reenact.rigs.formats.pieces import Choice
 
-    rig, contents = read_rig(file, Choice(parts, shapes))
-    facts = inspect(rig, contents)
+    with _busy(f"Reading {file}"):
+        rig, contents = read_rig(file, Choice(parts, shapes))
+        facts = inspect(rig, contents)
     console = Console(markup=False, emoji=False, highlight=False)
     for line in _facts(facts):
         console.print(line, soft_wrap=True)
@@ -569,10 +574,31 @@ _SUITE_NUMBERS = (
 """Tables that a suite prints; see `reenact.suite.measure`."""
 
 
+def _busy(words: str) -> Any:
+    """Says what takes a while, on a terminal, and takes it back."""
+    return Console(stderr=True, markup=False, emoji=False).status(words)
+
+
 def _moved(retargeter: Any, clip: str) -> Clip:
     from reenact.rigs.files import load_clip
 
-    return retargeter(load_clip(clip, retargeter.source))
+    with _busy("Retargeting"):
+        return retargeter(load_clip(clip, retargeter.source))
+
+
+def _moved_by_networks(retargeter: Any, clip: str) -> Clip:
+    """As `_moved`, with a bar: networks look at each frame by itself."""
+    import torch
+    from rich.progress import track
+
+    from reenact.rigs.files import load_clip
+
+    given = load_clip(clip, retargeter.source)
+    parts = given.weights.split(512)  # whole chunks of `ImageRetargeter`, so that nothing depends on the bar
+    console = Console(stderr=True)
+    shown = track(parts, "Retargeting", console=console, transient=True, disable=not console.is_terminal)
+    made = [retargeter(replace(given, weights=part, rotations=None)) for part in shown]
+    return replace(given, names=retargeter.target.names, weights=torch.cat([each.weights for each in made]))
 
 
 def _geometric(
@@ -606,15 +632,15 @@ def _geometric(
     if source is None:
         return _captured(inputs[-1], method, target, pairs, training)
     names = [source, target]
-    rigs = rigs or [load_rig(name) for name in names]
+    with _busy("Reading the rigs"):
+        rigs = rigs or [load_rig(name) for name in names]
     if reverse:
         names, rigs = names[::-1], rigs[::-1]
-    console = Console(stderr=True)
     found = None
     if method not in ("copy", "neutral"):
-        with console.status("Finding the correspondence"):
+        with _busy("Finding the correspondence"):
             found = register(*rigs, 300) if pairs is None else load_correspondence(pairs, *rigs)
-    with console.status(f"Preparing {method}"):
+    with _busy(f"Preparing {method}"):
         shown = None if training is None else load_clip(training, rigs[0])
         retargeter = METHODS[method](*rigs, found, shown)
     return _moved(retargeter, inputs[-1]), retargeter, names
@@ -638,7 +664,8 @@ def _captured(
     rig = load_rig(target)
     names, vertices = load_places(places, rig)
     shown = None if training is None else load_markers(training)
-    clip = drive(rig, load_markers(take), names, vertices, presets[method], shown)
+    with _busy("Retargeting"):
+        clip = drive(rig, load_markers(take), names, vertices, presets[method], shown)
     return clip, SimpleNamespace(source=SimpleNamespace(name=f"{len(names)} markers"), target=rig), [take, target]
 
 
@@ -686,7 +713,8 @@ def _convert_rig(input: str, output: Path, choice: Choice, fps: float | None, po
     folder = output.suffix == "" and output.parent.is_dir()
     if not folder:
         _check_out(output, _RIG_FILES)
-    rig, contents = read_rig(input, choice)
+    with _busy(f"Reading {input}"):
+        rig, contents = read_rig(input, choice)
     clip = None
     if contents.animations and output.suffix.lower() in (".glb", *_USD_FILES):
         with warnings.catch_warnings():
@@ -695,7 +723,8 @@ def _convert_rig(input: str, output: Path, choice: Choice, fps: float | None, po
                 clip = postprocess(_at_rate(load_clip(input, rig), fps), post)
             except ReenactError:
                 clip = None  # an animation of bones only
-    save_rig(rig, output.with_suffix(".obj") if folder else output, clip)
+    with _busy(f"Writing {output}"):
+        save_rig(rig, output.with_suffix(".obj") if folder else output, clip)
     motion = f", {len(clip)} frames at {clip.fps:g} fps" if clip is not None else ""
     print(f"{output}: {len(rig.neutral)} vertices, {len(rig.faces)} faces, {len(rig.names)} blendshapes{motion}")
 

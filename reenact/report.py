@@ -25,6 +25,7 @@ import matplotlib
 import numpy as np
 import torch
 from PIL import Image
+from rich.console import Console
 from torch import Tensor
 
 from reenact.atomic import write_atomically
@@ -829,7 +830,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     f"{numbers}: expected the numbers of a run, found none; run `reenact evaluate {folder}`"
                 )
             results.append(json.loads(numbers.read_text(encoding="utf-8")))
-        print(write_report(folders, results))
+        with Console(stderr=True, markup=False, emoji=False).status("Drawing"):
+            page = write_report(folders, results)
+        print(page)
     except (ReenactError, FileNotFoundError) as error:
         print(error, file=sys.stderr)
         return 2

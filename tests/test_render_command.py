@@ -14,7 +14,7 @@ from reenact.errors import ReenactError
 from reenact.portrait import Portrait
 from reenact.rigs import motion
 from reenact.rigs.clip import Clip
-from reenact.rigs.files import load_clip, save_rig
+from reenact.rigs.files import load_clip, save_clip, save_rig
 from reenact.video import Performance, performances, pictures, save_video
 
 
@@ -55,6 +55,20 @@ def test_a_folder_holds_the_frames_themselves(played, tmp_path):
     save_video(played, tmp_path / "empty", 32)
     assert len(list((tmp_path / "empty").iterdir())) == 7
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "out"]
+
+
+def test_a_fast_clip_becomes_a_gif_at_a_rate_that_it_has(files, toy_pair, tmp_path, capsys):
+    fast = motion.synthesize(toy_pair[0].names, 0.2, seed=3, fps=60.0)
+    save_clip(fast, tmp_path / "fast.npz")
+    out = tmp_path / "fast.gif"
+    assert main(["render", str(tmp_path / "fast.npz"), "--rig", files[0], "--size", "32", "--out", str(out)]) == 0
+    assert "60 frames per second became 30: a .gif has at most 50" in capsys.readouterr().out
+    with Image.open(out) as picture:
+        milliseconds = 0
+        for n in range(picture.n_frames):
+            picture.seek(n)
+            milliseconds += picture.info["duration"]
+    assert milliseconds == 200  # 12 frames at 60 became 6 at 30
 
 
 def test_a_gif_moves_and_keeps_its_length(played, tmp_path):
