@@ -41,7 +41,7 @@ from reenact.rigs.timeline import resampled
 SOURCE, SHOWN = "anny:man", "anny:toon"
 BESIDE = ("shape-matching", "consensus", "delta-transfer", "deformation-transfer", "rbf", "ribera-paper", "copy")
 """Methods that the second section compares."""
-SIZE, FPS = 192, 12
+SIZE, FPS = 192, 12.0
 
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">

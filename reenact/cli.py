@@ -272,7 +272,7 @@ def render(
         played = performances(inputs, rig, method, fps)
     if out.suffix.lower() == ".gif" and fps is None and played[0].clip.fps > 50:  # more than the format has
         print(f"{played[0].clip.fps:g} frames per second became 30: a .gif has at most 50")
-        played = [replace(each, clip=resampled(each.clip, 30)) for each in played]
+        played = [replace(each, clip=resampled(each.clip, 30.0)) for each in played]
     clip = played[0].clip
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Drawing", total=len(clip))
