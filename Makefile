@@ -63,8 +63,8 @@ $(RUN)/report.html: $(RUN)/trained
 test: $(READY)
 	@if command -v npm >/dev/null && [ ! -d .venv/node_modules/gltf-validator ]; then \
 		npm install --silent --no-save --no-audit --no-fund --prefix .venv gltf-validator@2.0.0-dev.3.10 || true; fi
-	@# One process per core, one thread each; a file's tests stay together, for what they share.
-	@OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist loadfile $(ARGS)
+	@# One process per core, one thread each; each begins with its half, and takes from the other's end.
+	@OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses auto --dist worksteal $(ARGS)
 
 lint: $(READY)
 	@$(BIN)/ruff check .
