@@ -612,9 +612,9 @@ def _geometric(
 ) -> tuple[Clip, Any, list[str]]:
     """A clip moved by a geometric method, the retargeter, and where the two rigs came from."""
     from reenact.retargeting import METHODS
-    from reenact.retargeting.correspondence import load_correspondence
+    from reenact.retargeting.correspondence import find_correspondence, load_correspondence
     from reenact.rigs.files import load_clip, load_rig
-    from reenact.run import Run, register
+    from reenact.run import Run
 
     rigs: list[Rig] = []
     if method not in METHODS:
@@ -639,7 +639,7 @@ def _geometric(
     found = None
     if method not in ("copy", "neutral"):
         with _busy("Finding the correspondence"):
-            found = register(*rigs, 300) if pairs is None else load_correspondence(pairs, *rigs)
+            found = find_correspondence(*rigs, 300) if pairs is None else load_correspondence(pairs, *rigs)
     with _busy(f"Preparing {method}"):
         shown = None if training is None else load_clip(training, rigs[0])
         retargeter = METHODS[method](*rigs, found, shown)

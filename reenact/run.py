@@ -25,7 +25,6 @@ import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -258,27 +257,11 @@ def _find_correspondences(rigs: dict[str, Rig], config: Config) -> dict[tuple[st
     found, given = {}, config.pairs.correspondence
     for first, second in _registered(rigs, config):
         found[first, second] = (
-            register(rigs[first], rigs[second], config.pairs.markers)
+            find_correspondence(rigs[first], rigs[second], config.pairs.markers)
             if given is None
             else load_correspondence(given, rigs[first], rigs[second])
         )
     return found
-
-
-def register(source: Rig, target: Rig, markers: int) -> Correspondence:
-    """Pairs of places of two rigs that are found; see `find_correspondence`.
-
-    Raises:
-        ReenactError: No correspondence can be found, also where a surface is so odd that the arithmetic breaks down.
-    """
-    try:
-        with np.errstate(all="ignore"):  # the sentence below says it better
-            return find_correspondence(source, target, markers)
-    except (RuntimeError, np.linalg.LinAlgError) as error:  # singular systems of SciPy, PyTorch and NumPy
-        raise ReenactError(
-            f"{source.name} and {target.name}: their surfaces cannot be registered ({error}); `reenact inspect` tells "
-            "what is odd about a rig (is it inside out?), or give pairs of places in a file of correspondences"
-        ) from error
 
 
 def _load_correspondences(folder: Path, config: Config, rigs: dict[str, Rig]) -> dict[tuple[str, str], Correspondence]:

@@ -29,11 +29,12 @@ from reenact.errors import ReenactError
 from reenact.folder import load_run_config
 from reenact.inspection import inspect
 from reenact.retargeting import METHODS
+from reenact.retargeting.correspondence import find_correspondence
 from reenact.rigs.clip import Clip
 from reenact.rigs.files import load_rig, read_rig, save_rig
 from reenact.rigs.formats.pieces import Choice
 from reenact.rigs.motion import expressions
-from reenact.run import Run, register
+from reenact.run import Run
 from reenact.training import train
 
 HERE = Path(__file__).parent
@@ -141,7 +142,7 @@ def tried(name: str, folder: Path) -> dict[str, str]:
 
     def retargeted() -> None:
         clip = Clip(ball.names, expressions(ball.names, 12, 3), 30.0)
-        moved = METHODS["shape-matching"](ball, rig, register(ball, rig, 50), None)(clip)
+        moved = METHODS["shape-matching"](ball, rig, find_correspondence(ball, rig, 50), None)(clip)
         assert torch.isfinite(moved.weights).all()
 
     for do in (looked_at, exported, lambda: train(config), *([retargeted] if small else [])):
@@ -200,7 +201,7 @@ def test_a_result_does_not_change_with_the_scale_of_a_rig(factor, tmp_path):
     images = replace(Config().images, resolution=32)
     moved, shown = [], []
     for rig in (egg, other):
-        moved.append(METHODS["shape-matching"](ball, rig, register(ball, rig, 50), None)(clip).weights)
+        moved.append(METHODS["shape-matching"](ball, rig, find_correspondence(ball, rig, 50), None)(clip).weights)
         shown.append(Studio(rig, images).glance(clip.weights))
     torch.testing.assert_close(moved[0], moved[1], rtol=0, atol=1e-4)
     torch.testing.assert_close(shown[0], shown[1], rtol=0, atol=1e-3)  # residuals of unit size: of 1 in 1,000

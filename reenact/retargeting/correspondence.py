@@ -152,10 +152,18 @@ def find_correspondence(
         whose pairs are known.
 
     Raises:
-        ReenactError: A rig does not move, or no four shapes of both move the face alike.
+        ReenactError: A rig does not move, no four shapes of both move the face alike, or a surface is so odd that the
+            arithmetic breaks down.
     """
     (ours, our_vertices), (theirs, their_vertices) = (thinned(rig, MOST_VERTICES) for rig in (source, target))
-    found = _correspondence(registration.register(ours, theirs, use_names))
+    try:
+        with np.errstate(all="ignore"):  # the sentence below says it better
+            found = _correspondence(registration.register(ours, theirs, use_names))
+    except (RuntimeError, np.linalg.LinAlgError) as error:  # singular systems of SciPy, PyTorch and NumPy
+        raise ReenactError(
+            f"{source.name} and {target.name}: their surfaces cannot be registered ({error}); `reenact inspect` tells "
+            "what is odd about a rig (is it inside out?), or give pairs of places in a file of correspondences"
+        ) from error
     dense = Correspondence(found.source.among(our_vertices), found.target.among(their_vertices), found.confidence)
     return dense if count is None else dense.sample(source, count)
 
