@@ -392,11 +392,11 @@ class RunLock:
             ReenactError: Another process has taken it over.
         """
         if not self._is_ours():
-            raise self._refusal(_parse(_content_of(self.path)), 0.0)
+            raise self._refusal(_parse(self.path.read_bytes()), 0.0)
 
     def _is_ours(self) -> bool:
         try:
-            return _content_of(self.path) == self._content
+            return self.path.read_bytes() == self._content
         except FileNotFoundError:  # somebody removed it; nobody else is named
             return True
 
@@ -414,10 +414,6 @@ class RunLock:
             f"{self.run_dir}: expected no other process to train here, got process {process}{owner} on {machine}"
             f"{heard}; wait for it, end it, or choose another run folder"
         )
-
-
-def _content_of(path: Path) -> bytes:
-    return path.read_bytes()
 
 
 def _user() -> str:

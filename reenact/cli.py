@@ -20,7 +20,7 @@ from tyro.extras import subcommand_cli_from_dict
 
 from reenact.config import Config, PostConfig, changed_settings, check_config, load_config
 from reenact.errors import MissingError, ReenactError
-from reenact.folder import load_run_config
+from reenact.folder import check_run
 
 # PyTorch's threads wait for work by spinning, and would take the cores from the renderer's threads, which run between
 # its operations. OpenMP reads this once, when PyTorch loads it.
@@ -61,7 +61,7 @@ def train(
     if resume:
         if settings.run is None:
             raise ReenactError("--resume: expected the folder of a run beside it, got none; add --run DIR")
-        saved = load_run_config(settings.run)
+        saved = loadcheck_run(settings.run)
         changed = changed_settings(saved, replace(settings, run=saved.run))
         if changed:
             raise ReenactError(
@@ -120,7 +120,7 @@ def infer(
             raise ReenactError(
                 f"infer: expected --method beside {', '.join(strange)}, got none; a run has its own rigs"
             )
-        _run_config(inputs[0])
+        check_run(inputs[0])
         from reenact.inference import ImageRetargeter
 
         with _busy("Loading the networks"):
@@ -181,7 +181,7 @@ def evaluate(
     if not runs:
         raise ReenactError("evaluate: expected at least one run folder, got none; name the folders after the command")
     for run in runs:
-        _run_config(run)
+        check_run(run)
     from reenact.evaluation import evaluate
     from reenact.report import write_report
 
@@ -523,7 +523,7 @@ def _train_defaults(arguments: list[str]) -> Config:
     if config is not None:
         return load_config(config)
     if run is not None and "--resume" in arguments:
-        return load_run_config(run)
+        return loadcheck_run(run)
     return Config()
 
 
@@ -674,7 +674,7 @@ def _infer_defaults(arguments: list[str]) -> PostConfig:
     if arguments[:1] != ["infer"]:
         return PostConfig()
     runs = [argument for argument in arguments[1:] if (Path(argument) / "config.toml").is_file()]
-    return load_run_config(runs[0]).post if runs else PostConfig()
+    return loadcheck_run(runs[0]).post if runs else PostConfig()
 
 
 def _option(arguments: list[str], name: str) -> str | None:
@@ -685,13 +685,6 @@ def _option(arguments: list[str], name: str) -> str | None:
         if argument.startswith(f"{name}="):
             return argument.removeprefix(f"{name}=")
     return None
-
-
-def _run_config(run: Path | str) -> Path:
-    path = Path(run) / "config.toml"
-    if not path.is_file():
-        raise MissingError(f"{run}: expected a run folder with config.toml in it, got none; `reenact train` makes one")
-    return path
 
 
 def _is_clip(input: str, output: Path) -> bool:

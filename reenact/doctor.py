@@ -31,8 +31,11 @@ EXTRAS = {
     "fbx": ("ufbx", "FBX files"),
     "usd": ("pxr", "USD files"),
     "mocap": ("c3d", ".c3d markers"),
+    "patches": ("pymetis", "more even patches in AnaConDaR"),
     "video": ("imageio_ffmpeg", ".mp4 films"),
     "opengl": ("pyrender", "--opengl, large pictures drawn by OpenGL"),
+    "tensorboard": ("tensorboard", "training.tensorboard"),
+    "docs": ("sphinx", "myst_parser", "furo", "make docs"),
     "dev": ("pytest", "ruff", "playwright", "tests of Reenact itself"),
 }
 """By extra: modules that it brings, then what for."""

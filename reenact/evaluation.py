@@ -494,11 +494,9 @@ def _correspondence(forward: Any, method: str) -> Correspondence | None:
     """The one that the run found, or found now; names alone need none."""
     if method in ("copy", "neutral"):
         return None
-    known, (source, target) = forward.run.correspondences, forward.keys
-    if (source, target) in known:
-        return known[source, target]
-    if (target, source) in known:
-        return known[target, source].reversed()
+    known = forward.run.correspondence(*forward.keys)
+    if known is not None:
+        return known
     return find_correspondence(forward.source, forward.target, forward.run.config.pairs.markers)
 
 
@@ -576,6 +574,8 @@ def evaluate_retargeters(
         for name in returned
     }
 
+    say("comparing methods")
+    moved = {f"method {name}": _retarget(method, clips) for name, method in (methods or {}).items()}
     say("comparing with the truth")
     known, truth, covered = true_weights(source, target, weights)
     true: dict[str, dict[str, Any]] = {}
@@ -590,7 +590,8 @@ def evaluate_retargeters(
         if paired is not None:
             answers["paired"] = forward.paired(known)
         for name, method in (methods or {}).items():
-            answers[f"method {name}"] = _retarget(method, _split(source.names, known, kinds, fps))
+            same, key = torch.equal(known, weights), f"method {name}"
+            answers[key] = moved[key] if same else _retarget(method, _split(source.names, known, kinds, fps))
         answers |= {
             "neutral": torch.zeros_like(truth),
             "mean_pose": truth.mean(0).expand_as(truth),
@@ -658,9 +659,7 @@ def evaluate_retargeters(
         "map_cyclic": cycle.maps["reenact"],
         "map_cyclic_neutral": cycle.maps["neutral"],
     }
-    say("comparing methods")
-    for name, method in (methods or {}).items():
-        arrays[f"method {name}"] = _retarget(method, clips).numpy()
+    arrays |= {name: weights.numpy() for name, weights in moved.items()}
     return numbers, arrays
 
 

@@ -35,6 +35,18 @@ def reenact_version() -> str:
         return "unknown"
 
 
+def check_run(folder: Path | str) -> None:
+    """Refuse what is no run folder, before any work.
+
+    Raises:
+        MissingError: There is no config.toml in it.
+    """
+    if not (Path(folder) / "config.toml").is_file():
+        raise MissingError(
+            f"{folder}: expected a run folder with config.toml in it, got none; `reenact train` makes one"
+        )
+
+
 def load_run_config(folder: Path | str) -> Config:
     """The settings of the run in a folder, as this version understands them; `run` is the folder itself.
 
@@ -43,11 +55,8 @@ def load_run_config(folder: Path | str) -> Config:
         ReenactError: The run is of a format that this version does not open, or its settings are damaged.
     """
     folder = Path(folder)
+    check_run(folder)
     path = folder / "config.toml"
-    if not path.is_file():
-        raise MissingError(
-            f"{folder}: expected a run folder with config.toml in it, got none; `reenact train` makes one"
-        )
     found = run_format(folder)
     table = read_table(path)
     for step in range(found, FORMAT):

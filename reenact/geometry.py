@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
+from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from reenact.errors import ReenactError
@@ -100,6 +101,37 @@ def cotangent_laplacian(
     edges.data = edges.data.clip(low, high)
     edges = edges + edges.T
     return (sparse.diags_array(edges.sum(axis=1)) - edges).tocsr()
+
+
+def mesh_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "E 2"]:
+    """Pairs of different vertices that a face joins, the lower index first, each once and in order."""
+    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
+    return edges[edges[:, 0] != edges[:, 1]]
+
+
+def edge_graph(points: Float[np.ndarray, "V 3"], edges: Int[np.ndarray, "E 2"]) -> sparse.csr_array:
+    """(V, V) lengths of edges in the unit of the points, once each; those without length have next to none."""
+    lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    lengths = np.maximum(lengths, 1e-9 * lengths.max(initial=1e-12))  # an edge of length 0 would be no edge
+    return sparse.coo_array((lengths, (edges[:, 0], edges[:, 1])), shape=(len(points),) * 2).tocsr()
+
+
+def nearest_along(
+    graph: sparse.csr_array, starts: Int[np.ndarray, "N"], limit: float = np.inf
+) -> tuple[Int[np.ndarray, "V"], Float[np.ndarray, "V"]]:
+    """For each vertex the nearest start along edges, as an index into `starts`, and its distance.
+
+    Args:
+        graph: Lengths, as of `edge_graph`.
+        starts: Vertices.
+        limit: What is farther counts as out of reach: index -1, distance infinite, as for pieces without a start.
+    """
+    distance, _, origin = dijkstra(
+        graph, directed=False, indices=starts, return_predecessors=True, min_only=True, limit=limit
+    )
+    number = np.full(graph.shape[0], -1)
+    number[starts] = np.arange(len(starts))
+    return np.where(np.isfinite(distance), number[origin], -1), distance
 
 
 def farthest_points(

@@ -169,6 +169,13 @@ class Run:
             crowded=config.training.crowded,
         )
 
+    def correspondence(self, source: str, target: str) -> Correspondence | None:
+        """Pairs of places from one rig's surface to the other's, by their keys; None where the settings ask for none."""
+        if (source, target) in self.correspondences:
+            return self.correspondences[source, target]
+        back = self.correspondences.get((target, source))
+        return None if back is None else back.reversed()
+
     def teacher(self, source: Studio, target: Studio, source_key: str, target_key: str) -> Teacher:
         """What is known of one rig's expressions on another; the settings must ask for pairs.
 
@@ -178,12 +185,10 @@ class Run:
             source_key: Where motion comes from.
             target_key: Where it goes to.
         """
-        there = self.correspondences.get((source_key, target_key))
-        back = self.correspondences.get((target_key, source_key))
         corrected = None
         if self.config.pairs.nudges is not None:
             corrected = labels(load_nudges(self.folder / _TAUGHT), source_key, target_key)[:2]
-        known = back.reversed() if there is None and back else there
+        known = self.correspondence(source_key, target_key)
         return find_teacher(source, target, self.config.pairs, known, corrected)
 
     def networks(self) -> Networks:

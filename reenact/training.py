@@ -407,11 +407,11 @@ def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], batch: dict[str, Ten
         if not pool.partners and training.read_loss:
             read = networks.bpnets[key](net.readable(drawn))
             add(f"read.{key}", training.read_loss * _weight_losses(shop, key, read, pool.weights[rows]).mean())
-        if bpnet.image_loss and done >= bpnet.image_from:
-            some = slice(max(1, round(bpnet.image_fraction * training.batch_size)))
+        rendered = done >= bpnet.image_from  # these terms cost more than all the rest
+        some = slice(max(1, round(bpnet.image_fraction * training.batch_size)))
+        if bpnet.image_loss and rendered:
             add(f"image.{key}", bpnet.image_loss * _image_loss(shop, key, predicted[some], described[some]))
-        if training.cycle_loss and done >= bpnet.image_from:
-            some = slice(max(1, round(bpnet.image_fraction * training.batch_size)))
+        if training.cycle_loss and rendered:
             add(f"cycle.{key}", training.cycle_loss * _cycle_loss(shop, key, features[some], described[some]))
     if training.align_loss:
         pairs = list(itertools.combinations(codes, 2))

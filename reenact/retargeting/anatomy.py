@@ -35,6 +35,7 @@ from reenact.geometry import (
     closest_points_around,
     cotangent_laplacian,
     farthest_points,
+    mesh_edges,
     rigid_fit,
     vertex_normals,
 )
@@ -44,7 +45,6 @@ from reenact.retargeting.landmarks import (
     Contact,
     Landmarks,
     along_surface,
-    mesh_edges,
     rigid_pose,
     smoothed,
     smoothing_matrix,

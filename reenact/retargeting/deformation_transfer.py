@@ -22,7 +22,7 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.sparse import coo_array, csr_array, diags_array, sparray
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -31,9 +31,12 @@ from reenact.errors import ReenactError
 from reenact.geometry import (
     closest_points,
     deformation_gradients,
+    edge_graph,
     face_areas,
     face_frames,
     farthest_points,
+    mesh_edges,
+    nearest_along,
     similarity_fit,
     sound_faces,
     vertex_normals,
@@ -328,7 +331,7 @@ def vertex_pairs(source: Rig, target: Rig, correspondence: Correspondence, reach
     total = votes.sum(1)
     paired = np.flatnonzero(total > 1e-6)
     shares = diags_array(1 / total[paired]) @ votes[paired]
-    nearest, fade = _nearest_along(target, paired, reach)
+    nearest, fade = _reached(target, paired, reach)
     chosen = np.flatnonzero(fade > 0)
     rows = coo_array((fade[chosen], (chosen, nearest[chosen])), shape=(len(total), len(paired))).tocsr()
     return (rows @ shares @ sampled).tocsr()
@@ -351,19 +354,13 @@ def _sampling(places: Places, count: int) -> csr_array:
     return coo_array((shares[kept], (rows[kept], corners[kept])), shape=(len(places), count)).tocsr()
 
 
-def _nearest_along(rig: Rig, paired: ndarray, reach: float) -> tuple[ndarray, ndarray]:
+def _reached(rig: Rig, paired: ndarray, reach: float) -> tuple[ndarray, ndarray]:
     """For each vertex the paired one that is nearest along edges, as an index into `paired`, and how far it holds."""
     points, faces = rig.neutral.double().numpy(), rig.faces.numpy()
-    edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) + 1e-12
-    graph = coo_array((lengths, (edges[:, 0], edges[:, 1])), shape=(len(points),) * 2).tocsr()
-    distance, _, origin = dijkstra(graph, directed=False, indices=paired, return_predecessors=True, min_only=True)
-    rank = np.zeros(len(points), int)
-    rank[paired] = np.arange(len(paired))
+    nearest, distance = nearest_along(edge_graph(points, mesh_edges(faces)), paired)
     limit = reach * np.ptp(points[:, 1])
     fade = np.clip(2 - distance / limit, 0, 1) if limit > 0 else (distance == 0).astype(float)
-    return rank[np.where(np.isfinite(distance), origin, paired[0])], fade
+    return np.maximum(nearest, 0), fade
 
 
 def face_pairs(source: Rig, target: Rig, followed: csr_array) -> csr_array:
@@ -439,7 +436,7 @@ def _joined(first: Places, second: Places) -> Places:
 def _gaps(rig: Rig, places: Places) -> tuple[ndarray, ndarray]:
     """Vertices that are not close to any place along the surface, and vertices of pieces that hold a place."""
     paired = np.unique(places.corners.numpy()[places.shares.numpy() > 1e-6])
-    _, fade = _nearest_along(rig, paired, 0.01)
+    _, fade = _reached(rig, paired, 0.01)
     pieces = connected_pieces(rig.faces.numpy(), len(rig.neutral))
     held = np.isin(pieces, pieces[paired])
     return (fade == 0) & held, held

@@ -9,13 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.sparse import coo_array, csr_array, diags_array
-from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from reenact.geometry import (
-    rigid_fit,
-)
+from reenact.geometry import edge_graph, mesh_edges, nearest_along, rigid_fit
 from reenact.retargeting.deformation_transfer import connected_pieces
 from reenact.retargeting.registration import Face
 from reenact.rigs.rig import Rig
@@ -176,10 +173,6 @@ def _loose_pieces(rig: Rig, face: Face, jaw_shape: int, motion: tuple[ndarray, n
     return tuple(np.concatenate(found) if found else np.zeros(0, np.int64) for found in (jaw, skull))
 
 
-def mesh_edges(faces: Int[ndarray, "M 3"]) -> Int[ndarray, "E 2"]:
-    return np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-
-
 def smoothing_matrix(faces: Int[ndarray, "M 3"], count: int) -> csr_array:
     """(N, N): each value half way to the mean of its neighbours."""
     edges = mesh_edges(faces)
@@ -191,6 +184,7 @@ def smoothing_matrix(faces: Int[ndarray, "M 3"], count: int) -> csr_array:
 
 
 def smoothed(smoother: csr_array, values: Float[ndarray, "*shape"], steps: int) -> Float[ndarray, "*shape"]:
+    """Values of vertices after some steps of a `smoothing_matrix`."""
     for _ in range(steps):
         values = smoother @ values
     return values
@@ -198,10 +192,7 @@ def smoothed(smoother: csr_array, values: Float[ndarray, "*shape"], steps: int) 
 
 def along_surface(face_faces: ndarray, points: ndarray, starts: ndarray, limit: float = np.inf) -> Float[ndarray, "N"]:
     """Distance along edges to the nearest of some vertices."""
-    edges = mesh_edges(face_faces)
-    lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) + 1e-12
-    graph = coo_array((lengths, (edges[:, 0], edges[:, 1])), shape=(len(points),) * 2).tocsr()
-    return dijkstra(graph, directed=False, indices=starts, min_only=True, limit=limit)
+    return nearest_along(edge_graph(points, mesh_edges(face_faces)), starts, limit)[1]
 
 
 def _lips(face: Face, share: Float[ndarray, "N"], height: float) -> Int[ndarray, "P 2"] | None:

@@ -34,7 +34,14 @@ from torch import Tensor
 from reenact.errors import ReenactError
 from reenact.retargeting.anatomy import Shell
 from reenact.retargeting.contact import Side
-from reenact.retargeting.tetrahedra import compiled, factored, nearest_rotations, stiffness_matrix, turn_towards
+from reenact.retargeting.tetrahedra import (
+    compiled,
+    factored,
+    gradient_of,
+    nearest_rotations,
+    stiffness_matrix,
+    turn_towards,
+)
 
 _GRAVITY = 0.125
 """Half of density x gravity x height of the face / shear modulus: 1,000 kg/m^3, 9.8 m/s^2, 0.125 m, 5 kPa."""
@@ -391,12 +398,7 @@ def _stretches(points, tets, vectors, turns, stretches):
     """S = R^T F of each tetrahedron, made symmetric, in place."""
     f, s = np.empty((3, 3)), np.empty((3, 3))
     for e in range(len(tets)):
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for c in range(4):
-                    total += points[tets[e, c], i] * vectors[e, c, j]
-                f[i, j] = total
+        gradient_of(points, tets[e], vectors[e], f)
         for i in range(3):
             for j in range(3):
                 s[i, j] = turns[e, 0, i] * f[0, j] + turns[e, 1, i] * f[1, j] + turns[e, 2, i] * f[2, j]
@@ -411,13 +413,8 @@ def _project(points, tets, vectors, weights, band, turns, muscle_turns, stretche
     f, r, p, cofactor = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     g = np.empty((3, 3))
     for e in range(len(tets)):
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for c in range(4):
-                    total += points[tets[e, c], i] * vectors[e, c, j]
-                f[i, j] = total
-                p[i, j] = 0.0
+        gradient_of(points, tets[e], vectors[e], f)
+        p[:] = 0.0
         if weights[e, 0] > 0:
             for i in range(3):
                 for j in range(3):

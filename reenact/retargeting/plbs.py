@@ -33,13 +33,13 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.sparse import bsr_array, coo_array, csr_array, diags_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reenact.errors import ReenactError
-from reenact.geometry import farthest_points
+from reenact.geometry import edge_graph, farthest_points, mesh_edges, nearest_along
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import apply_sparse, connected_pieces, densify, vertex_pairs
 from reenact.rigs.rig import Rig
@@ -134,9 +134,9 @@ class Patches:
         shares = (pairs @ self.shares).tocsr()
         paired = np.flatnonzero(shares.sum(1) > 1e-6)
         graph = mesh_graph(target, bridges=False)
-        distance, _, origin = dijkstra(graph, directed=False, indices=paired, return_predecessors=True, min_only=True)
-        shares = shares[np.where(np.isfinite(distance), origin, paired[0])]
-        lost = np.flatnonzero(np.isinf(distance))
+        nearest, _ = nearest_along(graph, paired)
+        shares = shares[paired[np.maximum(nearest, 0)]]
+        lost = np.flatnonzero(nearest < 0)
         if len(lost):
             here, there = target.neutral.double().numpy(), source.neutral.double().numpy()
             beside = paired[cKDTree(here[paired]).query(here[lost])[1]]
@@ -177,14 +177,10 @@ def mesh_graph(rig: Rig, bridges: bool = True) -> csr_array:
     the pieces that are tied already, the largest first.
     """
     points, faces = rig.neutral.double().numpy(), rig.faces.numpy()
-    ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    ends = mesh_edges(faces)
     if bridges:
         ends = np.concatenate([ends, _bridges(points, ends)])
-    ends = np.unique(np.sort(ends, axis=1), axis=0)
-    ends = ends[ends[:, 0] != ends[:, 1]]
-    lengths = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
-    lengths = np.maximum(lengths, 1e-9 * lengths.max())  # an edge of length 0 would be no edge
-    graph = coo_array((lengths, (ends[:, 0], ends[:, 1])), shape=(len(points),) * 2).tocsr()
+    graph = edge_graph(points, ends)
     return (graph + graph.T).tocsr()
 
 
@@ -227,21 +223,14 @@ def partition(rig: Rig, count: int, metis: bool | None = None) -> Int[ndarray, "
     points = rig.neutral.double()
     seeds = farthest_points(points, count).numpy()
     for _ in range(3):
-        labels = _nearest_seed(graph, seeds)
+        labels, _ = nearest_along(graph, seeds)
         middles = np.stack([np.bincount(labels, axis, count) for axis in points.numpy().T], 1)
         middles /= np.maximum(np.bincount(labels, minlength=count), 1)[:, None]
         distance = np.linalg.norm(points.numpy() - middles[labels], axis=1)
         order = np.lexsort((distance, labels))
         found, first = np.unique(labels[order], return_index=True)
         seeds[found] = order[first]
-    return np.unique(_nearest_seed(graph, seeds), return_inverse=True)[1]
-
-
-def _nearest_seed(graph: csr_array, seeds: Int[ndarray, "P"]) -> Int[ndarray, "V"]:
-    _, _, origin = dijkstra(graph, directed=False, indices=seeds, return_predecessors=True, min_only=True)
-    number = np.zeros(graph.shape[0], np.int64)
-    number[seeds] = np.arange(len(seeds))
-    return number[origin]
+    return np.unique(nearest_along(graph, seeds)[0], return_inverse=True)[1]
 
 
 # ---------------------------------------------------------------------------------------------------------------------

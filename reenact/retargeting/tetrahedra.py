@@ -60,6 +60,17 @@ def scatter(sides, tets, vectors, matrices):
 
 
 @compiled
+def gradient_of(points, tet, vectors, f):
+    """The gradient of one tetrahedron, in place: sum over its corners of place x gradient of the hat function."""
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for c in range(4):
+                total += points[tet[c], i] * vectors[c, j]
+            f[i, j] = total
+
+
+@compiled
 def nearest_rotations(points, tets, vectors, turns, steps):
     """Rotations closest to the gradients, from those of the last time, in place; a few steps of a safe iteration.
 
@@ -68,19 +79,12 @@ def nearest_rotations(points, tets, vectors, turns, steps):
     """
     f, r = np.empty((3, 3)), np.empty((3, 3))
     for e in range(len(tets)):
-        for i in range(3):
-            for j in range(3):
-                total = 0.0
-                for c in range(4):
-                    total += points[tets[e, c], i] * vectors[e, c, j]
-                f[i, j] = total
-                r[i, j] = turns[e, i, j]
+        gradient_of(points, tets[e], vectors[e], f)
+        r[:] = turns[e]
         for _ in range(steps):
             if turn_towards(f, r) < 1e-6:
                 break
-        for i in range(3):
-            for j in range(3):
-                turns[e, i, j] = r[i, j]
+        turns[e] = r
 
 
 @compiled

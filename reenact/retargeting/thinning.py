@@ -12,11 +12,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
-from reenact.geometry import farthest_points
+from reenact.geometry import edge_graph, farthest_points, mesh_edges, nearest_along
 from reenact.rigs.rig import Rig
 
 _STILL = 0.2
@@ -51,14 +49,9 @@ def thinned(rig: Rig, count: int) -> tuple[Rig, Int[Tensor, "N"]]:
 
 def _joined(rig: Rig, chosen: Int[np.ndarray, "N"]) -> Int[np.ndarray, "F 3"]:
     """Triangles between neighbourhoods of the chosen vertices, as indices of these; each once."""
-    points, faces = rig.neutral.double().numpy(), rig.faces.numpy()
-    ends = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
-    lengths = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
-    graph = coo_array((np.maximum(lengths, 1e-12), (ends[:, 0], ends[:, 1])), shape=(len(points),) * 2).tocsr()
-    _, _, origin = dijkstra(graph, directed=False, indices=chosen, return_predecessors=True, min_only=True)
-    number = np.full(len(points) + 1, -1)
-    number[chosen] = np.arange(len(chosen))
-    corners = number[np.where(origin < 0, len(points), origin)][faces]  # pieces without a chosen vertex have none
+    faces = rig.faces.numpy()
+    graph = edge_graph(rig.neutral.double().numpy(), mesh_edges(faces))
+    corners = nearest_along(graph, chosen)[0][faces]  # pieces without a chosen vertex have none
     a, b, c = corners.T
     corners = corners[(corners >= 0).all(1) & (a != b) & (b != c) & (c != a)]
     _, first = np.unique(np.sort(corners, axis=1), axis=0, return_index=True)
