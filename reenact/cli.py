@@ -264,14 +264,14 @@ def render(
     from rich.progress import Progress
 
     from reenact.rigs.timeline import resampled
-    from reenact.video import check_out, performances, save_video
+    from reenact.video import GIF_RATE, check_out, performances, save_video
 
     check_out(out, audio)
     console = Console(stderr=True)
     with console.status("Loading"):
         played = performances(inputs, rig, method, fps)
-    if out.suffix.lower() == ".gif" and fps is None and played[0].clip.fps > 50:  # more than the format has
-        print(f"{played[0].clip.fps:g} frames per second became 30: a .gif has at most 50")
+    if out.suffix.lower() == ".gif" and fps is None and played[0].clip.fps > GIF_RATE:
+        print(f"{played[0].clip.fps:g} frames per second became 30: a .gif has at most {GIF_RATE}")
         played = [replace(each, clip=resampled(each.clip, 30.0)) for each in played]
     clip = played[0].clip
     with Progress(console=console, transient=True) as progress:

@@ -30,6 +30,12 @@ def face_areas(vertices: Float[Tensor, "*batch V 3"], faces: Int[Tensor, "F 3"])
     return torch.linalg.cross(second - first, third - first).norm(dim=-1) / 2
 
 
+def vertex_areas(points: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Float[np.ndarray, "V"]:
+    """A third of the faces around each vertex, in square units of the points."""
+    areas = face_areas(torch.from_numpy(points), torch.from_numpy(faces)).numpy()
+    return np.bincount(faces.ravel(), weights=np.repeat(areas / 3, 3), minlength=len(points))
+
+
 def face_frames(vertices: Float[Tensor, "*batch V 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "*batch F 3 3"]:
     """Two edges and the scaled normal of each face, as columns; without area, the normal is 0.
 

@@ -170,7 +170,7 @@ class Run:
         )
 
     def correspondence(self, source: str, target: str) -> Correspondence | None:
-        """Pairs of places from one rig's surface to the other's, by their keys; None where the settings ask for none."""
+        """Pairs of places from one rig to another, by their keys; None where the settings ask for none."""
         if (source, target) in self.correspondences:
             return self.correspondences[source, target]
         back = self.correspondences.get((target, source))

@@ -33,7 +33,7 @@ SUFFIXES = (".mp4", ".gif", "")
 
 _CHUNK = 8
 """Frames that are drawn at once."""
-_GIF_RATE = 50
+GIF_RATE = 50
 """Frames per second that browsers still play as they are told; they slow down what is faster."""
 _COLORS_FROM = 12
 """Frames that the colours of a .gif are chosen from."""
@@ -131,8 +131,8 @@ def save_video(
     """
     suffix, fps = out.suffix.lower(), played[0].clip.fps
     check_out(out, audio)
-    if suffix == ".gif" and fps > _GIF_RATE:
-        raise ReenactError(f"{out}: a .gif has at most {_GIF_RATE} frames per second, got {fps:g}; add --fps 30")
+    if suffix == ".gif" and fps > GIF_RATE:
+        raise ReenactError(f"{out}: a .gif has at most {GIF_RATE} frames per second, got {fps:g}; add --fps 30")
     try:
         frames = _counted(pictures(played, size, opengl), drawn)
         if suffix == ".mp4":

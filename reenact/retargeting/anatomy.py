@@ -34,9 +34,11 @@ from reenact.errors import ReenactError
 from reenact.geometry import (
     closest_points_around,
     cotangent_laplacian,
+    face_areas,
     farthest_points,
     mesh_edges,
     rigid_fit,
+    vertex_areas,
     vertex_normals,
 )
 from reenact.retargeting.correspondence import Correspondence
@@ -261,8 +263,7 @@ class Shell:
     @cached_property
     def skin_areas(self) -> Float[ndarray, "N"]:
         """A third of the skin around each node, square metres."""
-        skin = self.nodes[: len(self)].numpy()
-        return np.bincount(self.skin_faces.ravel(), np.repeat(_areas(skin, self.skin_faces) / 3, 3), len(self))
+        return vertex_areas(self.nodes[: len(self)].numpy(), self.skin_faces)
 
     @cached_property
     def colliders(self) -> Int[ndarray, "D"]:
@@ -500,7 +501,7 @@ def _carried_layers(shell: Shell, bent: Float[ndarray, "N 3"]) -> Float[ndarray,
 
 def _local_scale(faces: ndarray, before: ndarray, after: ndarray) -> Float[ndarray, "N"]:
     """Root of how much larger the skin is around each vertex."""
-    sums = [np.bincount(faces.ravel(), np.repeat(_areas(points, faces), 3)) for points in (before, after)]
+    sums = [vertex_areas(points, faces) for points in (before, after)]
     ratio = np.sqrt(sums[1] / np.maximum(sums[0], 1e-30))
     return smoothed(smoothing_matrix(faces, len(ratio)), ratio, 4).clip(0.2, 5.0)
 
@@ -560,11 +561,12 @@ def _layers(
     fractions = np.arange(config.layers + 1) / config.layers
     tets = prisms(faces, len(skin), config.layers)
     owner = np.repeat(np.tile(np.arange(len(faces)), config.layers), 3)
+    areas = face_areas(torch.from_numpy(skin), torch.from_numpy(faces)).numpy()
     for _ in range(12):
         layers = skin + fractions[:, None, None] * (depth[:, None] * inward)
         volumes = tet_volumes(layers.reshape(-1, 3), tets)
         # A sixth of what a straight prism would give each of its three.
-        least = (_areas(skin, faces) * depth[faces].min(1) / config.layers / 3 / 6)[owner].clip(min=3e-9 * height**3)
+        least = (areas * depth[faces].min(1) / config.layers / 3 / 6)[owner].clip(min=3e-9 * height**3)
         failed = np.unique(owner[volumes < least])
         if len(failed) == 0:
             break
@@ -595,11 +597,6 @@ def _untangled(
             near = np.isin(tets, tets[failed]).any(1)
             untangle(nodes, tets[near], goal[near], mobility, 30)
     return nodes
-
-
-def _areas(points: ndarray, faces: ndarray) -> Float[ndarray, "F"]:
-    a, b, c = points[faces].swapaxes(0, 1)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
 def _inward(skin: ndarray, faces: ndarray, smoother: csr_array, steps: int) -> Float[ndarray, "N 3"]:
@@ -759,8 +756,7 @@ def _harmonic(rig: Rig, unknown: ndarray, numbers: ndarray, place: ndarray) -> c
     count = len(rig.neutral)
     laplacian = cotangent_laplacian(rig.neutral.double(), rig.faces, low=1e-3)
     size = np.ptp(rig.neutral.double().numpy()[:, 1])
-    thirds = np.repeat(_areas(rig.neutral.double().numpy(), rig.faces.numpy()) / 3, 3)
-    areas = np.bincount(rig.faces.numpy().ravel(), thirds, count)
+    areas = vertex_areas(rig.neutral.double().numpy(), rig.faces.numpy())
     screened = laplacian + diags_array(areas / (0.1 * size) ** 2 + 1e-12)
     cross = screened[unknown][:, numbers].tocsc()
     touching = np.flatnonzero(np.diff(cross.indptr))

@@ -32,7 +32,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from reenact.errors import ReenactError
-from reenact.geometry import closest_points_around, cotangent_laplacian, similarity_fit, vertex_normals
+from reenact.geometry import closest_points_around, cotangent_laplacian, similarity_fit, vertex_areas, vertex_normals
 from reenact.rigs import arkit
 from reenact.rigs.rig import Rig
 
@@ -143,7 +143,7 @@ class Face:
             vertices,
             own_points,
             normals,
-            _vertex_areas(own_points, own_faces),
+            vertex_areas(own_points, own_faces),
             own_faces,
             np.ascontiguousarray(deltas[:, vertices]),
             strength[vertices],
@@ -163,14 +163,8 @@ def _sheet(rig: Rig, points: np.ndarray, faces: np.ndarray, strength: np.ndarray
     count = int(place.max()) + 1
     _, piece = connected_components(coo_array((np.ones(len(ends[0])), ends), shape=(count, count)), directed=False)
     piece = piece[place]
-    moved_area = np.bincount(piece, weights=_vertex_areas(points, kept) * strength)
+    moved_area = np.bincount(piece, weights=vertex_areas(points, kept) * strength)
     return marked & (piece == moved_area.argmax())
-
-
-def _vertex_areas(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    first, second, third = points[faces].swapaxes(0, 1)
-    areas = np.linalg.norm(np.cross(second - first, third - first), axis=1) / 6
-    return np.bincount(faces.ravel(), weights=np.repeat(areas, 3), minlength=len(points))
 
 
 # ---- which shape is which ----
@@ -392,7 +386,7 @@ def _features(
             length = np.linalg.norm(delta, axis=1, keepdims=True)
             reach = np.log1p(length / (_FLOOR * length.max()))
             little = 1e-3 * face.areas.mean()
-            stretch = (_vertex_areas(face.points + delta / 2, face.faces) + little) / (face.areas + little)
+            stretch = (vertex_areas(face.points + delta / 2, face.faces) + little) / (face.areas + little)
             columns += [reach, reach * (delta @ turn.T) / length.clip(1e-12)]
             columns.append(2 * np.log(stretch).clip(-2, 2)[:, None])
         return np.concatenate(columns, 1)

@@ -26,6 +26,7 @@ from reenact.errors import ReenactError
 from reenact.nudges import Nudges, load_nudges, parse_nudges, save_nudges
 from reenact.portrait import CAMERA_DISTANCE, HALF_HEIGHT, Portrait
 from reenact.retargeting import METHODS
+from reenact.retargeting.correspondence import Correspondence, find_correspondence
 from reenact.rigs.clip import Clip
 from reenact.rigs.files import RIG_SUFFIXES, load_clip, load_rig, read_clip, save_clip
 from reenact.rigs.matching import conform
@@ -318,8 +319,13 @@ class Session:
             return lambda clip: replace(clip, names=target.names, weights=self._true(target, clip.weights))
         found = None
         if method not in ("copy", "neutral"):
-            found = self._once(("correspondence", key), lambda: _found(source, target))
+            found = self._once(("correspondence", key), lambda: self._correspondence(key))
         return METHODS[method](source, target, found, None)
+
+    def _correspondence(self, key: str) -> Correspondence:
+        """From the source to a target: that of the run, or found now, which takes seconds."""
+        known = None if self.run is None else self.run.correspondence(self.source, key)
+        return find_correspondence(self.rigs[self.source], self.rigs[key], _MARKERS) if known is None else known
 
     def _networks(self) -> Any:
         from reenact.inference import ImageRetargeter
@@ -332,12 +338,6 @@ class Session:
             if name not in self._made:
                 self._made[name] = make()
             return self._made[name]
-
-
-def _found(source: Rig, target: Rig) -> Any:
-    from reenact.retargeting.correspondence import find_correspondence
-
-    return find_correspondence(source, target, _MARKERS)
 
 
 def _own_clip(path: Path) -> Clip | None:
