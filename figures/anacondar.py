@@ -76,7 +76,7 @@ def show(rows: list[list[tuple[np.ndarray, str]]], path: Path) -> None:
     for line, row in zip(axes, rows):
         for axis, (pixels, title) in zip(line, row):
             axis.imshow(pixels)
-            axis.set_title(title, fontsize=9)
+            axis.set_title(title, fontsize=12)
     figure.tight_layout(pad=0.4)
     figure.savefig(path, dpi=80, pil_kwargs={"optimize": True})
     plt.close(figure)
