@@ -61,7 +61,7 @@ def train(
     if resume:
         if settings.run is None:
             raise ReenactError("--resume: expected the folder of a run beside it, got none; add --run DIR")
-        saved = loadcheck_run(settings.run)
+        saved = load_run_config(settings.run)
         changed = changed_settings(saved, replace(settings, run=saved.run))
         if changed:
             raise ReenactError(
@@ -523,7 +523,7 @@ def _train_defaults(arguments: list[str]) -> Config:
     if config is not None:
         return load_config(config)
     if run is not None and "--resume" in arguments:
-        return loadcheck_run(run)
+        return load_run_config(run)
     return Config()
 
 
@@ -674,7 +674,7 @@ def _infer_defaults(arguments: list[str]) -> PostConfig:
     if arguments[:1] != ["infer"]:
         return PostConfig()
     runs = [argument for argument in arguments[1:] if (Path(argument) / "config.toml").is_file()]
-    return loadcheck_run(runs[0]).post if runs else PostConfig()
+    return load_run_config(runs[0]).post if runs else PostConfig()
 
 
 def _option(arguments: list[str], name: str) -> str | None:

@@ -135,9 +135,9 @@ def nearest_along(
     distance, _, origin = dijkstra(
         graph, directed=False, indices=starts, return_predecessors=True, min_only=True, limit=limit
     )
-    number = np.full(graph.shape[0], -1)
+    number = np.full(graph.shape[0] + 1, -1)
     number[starts] = np.arange(len(starts))
-    return np.where(np.isfinite(distance), number[origin], -1), distance
+    return number[np.maximum(origin, -1)], distance  # the origin of what no start reaches is negative
 
 
 def farthest_points(
