@@ -20,7 +20,7 @@ from tyro.extras import subcommand_cli_from_dict
 
 from reenact.config import Config, PostConfig, changed_settings, check_config, load_config
 from reenact.errors import MissingError, ReenactError
-from reenact.folder import check_run
+from reenact.folder import check_run, load_run_config
 
 # PyTorch's threads wait for work by spinning, and would take the cores from the renderer's threads, which run between
 # its operations. OpenMP reads this once, when PyTorch loads it.

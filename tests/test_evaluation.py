@@ -13,10 +13,12 @@ import torch
 from skimage.metrics import structural_similarity
 
 from reenact import evaluation
+from reenact.config import Config
 from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence, Places
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
+from reenact.run import Run
 
 NAMES = ("jawOpen", "eyeBlinkLeft", "eyeBlinkRight", "mouthSmileLeft", "mouthSmileRight", "browInnerUp", "cheekPuff")
 
@@ -522,7 +524,7 @@ def test_an_unknown_method_is_refused_before_anything_is_loaded(tmp_path):
 
 def test_a_method_takes_the_correspondence_that_the_run_found():
     found = Correspondence(Places.at(torch.arange(8)), Places.at(torch.arange(8, 16)), torch.ones(8))
-    run = types.SimpleNamespace(correspondences={("a", "b"): found})
+    run = Run(Path("run"), Config(), {}, {}, {("a", "b"): found})
     forward, back = (types.SimpleNamespace(run=run, keys=keys) for keys in (("a", "b"), ("b", "a")))
     assert evaluation._correspondence(forward, "copy") is None
     assert evaluation._correspondence(forward, "rbf") is found
