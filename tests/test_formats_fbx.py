@@ -2,6 +2,9 @@
 
 import contextlib
 import io
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -355,6 +358,25 @@ def survive(tmp_path: Path, sample: bytes, count: int, by_line: bool) -> None:
             messages.append(str(error))
     assert all(message.startswith(str(path)) for message in messages)
     assert len(messages) > count // 5
+
+
+@pytest.mark.parametrize("threshold", [70, 700, 1000])
+def test_a_file_is_read_whenever_garbage_is_collected(threshold):
+    """ufbx 0.0.5 crashes where a scene that nobody holds any more is collected."""
+    code = (
+        f"import gc, sys; gc.set_threshold({threshold}, 1, 1)\n"
+        "from reenact.rigs.formats import isolated\n"
+        "isolated.main('fbx_scene:scene', *sys.argv[1:], str(16 << 30))"
+    )
+    places = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, "-c", code, FIXTURE, FIXTURE],
+        capture_output=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": places},
+    )
+    assert done.returncode == 0, done.stderr.decode()[-2000:]
+    assert len(done.stdout) > 1000
 
 
 def samples() -> list[bytes]:

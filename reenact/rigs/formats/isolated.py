@@ -6,6 +6,7 @@ time and memory reads the file instead, and answers in JSON and plain arrays; no
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
 import os
@@ -154,6 +155,7 @@ def main(task: str, path: str, shown: str, limit: str) -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     except (ImportError, ValueError, OSError):  # Windows has no such limits
         pass
+    gc.disable()  # ufbx 0.0.5 frees a scene before what is in it, and crashes; nothing here lives long
     module, function = task.split(":")
     try:
         answer = getattr(importlib.import_module(f"reenact.rigs.formats.{module}"), function)(Path(path))
