@@ -19,7 +19,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from tyro.extras import subcommand_cli_from_dict
 
 from reenact.config import Config, PostConfig, changed_settings, check_config, load_config
-from reenact.errors import MissingError, ReenactError
+from reenact.errors import MissingError, ReenactError, interruptions
 from reenact.folder import check_run, load_run_config
 
 # PyTorch's threads wait for work by spinning, and would take the cores from the renderer's threads, which run between
@@ -464,12 +464,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 "train": partial(train, settings=_train_defaults(arguments)),
                 "infer": partial(infer, post=_infer_defaults(arguments)),
             }
-            status = subcommand_cli_from_dict(
-                commands,
-                prog="reenact",
-                description="Any two blendshape rigs and a clip for the first: returns the clip on the second.",
-                args=arguments,
-            )
+            with interruptions():
+                status = subcommand_cli_from_dict(
+                    commands,
+                    prog="reenact",
+                    description="Any two blendshape rigs and a clip for the first: returns the clip on the second.",
+                    args=arguments,
+                )
         except KeyboardInterrupt:
             with suppress(KeyboardInterrupt):  # who is impatient presses it twice
                 _say(console, "red", "stopped", "by the keyboard")

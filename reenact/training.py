@@ -44,7 +44,7 @@ from reenact.checkpoint import (
 )
 from reenact.config import Config
 from reenact.data import Studio, jitter
-from reenact.errors import ReenactError
+from reenact.errors import ReenactError, interruptions
 from reenact.folder import migrate
 from reenact.losses import VertexDistance, code_distance, weight_distance
 from reenact.models import Networks
@@ -727,7 +727,8 @@ class _Interrupts:
         try:
             if self.asked is not None:
                 raise self.asked
-            yield
+            with interruptions():
+                yield
         finally:
             self._patient = before
 
@@ -745,7 +746,8 @@ def _interrupts() -> Iterator[_Interrupts]:
         except ValueError:  # not the main thread: signals are somebody else's
             break
     try:
-        yield interrupts
+        with interruptions():
+            yield interrupts
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
