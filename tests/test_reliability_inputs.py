@@ -126,10 +126,12 @@ def tried(name: str, folder: Path) -> dict[str, str]:
     """What becomes of a rig: `ok`, or the sentence of the refusal, by what was done with it."""
     ball, found = make_toy_rig("ball"), {}
     rig = make(name)
-    save_rig(rig, folder / "ugly.npz")
+    for each, file in ((ball, "nice.npz"), (rig, "ugly.npz")):
+        save_rig(each, folder / file)
     small = name not in LARGE
     config = settings(folder, 0, steps=2, save_every=2)
-    config = replace(config, target=str(folder / "ugly.npz"), run=str(folder / "run"))
+    rigs = {"source": str(folder / "nice.npz"), "target": str(folder / "ugly.npz")}
+    config = replace(config, **rigs, run=str(folder / "run"))
     if not small:
         config = replace(config, pairs=replace(config.pairs, method="none"))
 
