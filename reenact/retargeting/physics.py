@@ -14,6 +14,7 @@ sum is solved with one matrix that never changes.
          + characteristics |slits, widths and contours - those of the source in the target's size|^2
          + contact |x_v - surface|^2 where v is inside the other lip, the other lid or a tooth
          - force . X,    skull, jaw and the border of the face held
+    subject to    volume of all tissue in 1 +- whole
 
 Lengths are in heights of the face, so that weights are numbers and size does not matter. What contact is left after the
 last step is taken out by moving both sides apart.
@@ -40,7 +41,9 @@ from reenact.retargeting.tetrahedra import (
     gradient_of,
     nearest_rotations,
     stiffness_matrix,
+    tet_volumes,
     turn_towards,
+    volume_gradient,
 )
 
 _GRAVITY = 0.125
@@ -59,6 +62,8 @@ class PhysicsConfig:
     """Tissue keeps its volume."""
     band: float = 0.005
     """Share by which the volume of a tetrahedron may change for nothing."""
+    whole: float = 0.01
+    """Share by which the volume of all tissue may change at most."""
     muscle: float = 1.0
     """Muscle has the stretch that the transfer asks for."""
     skin: float = 400.0
@@ -76,7 +81,7 @@ class PhysicsConfig:
 
     def __post_init__(self) -> None:
         weights = (self.elasticity, self.volume, self.muscle, self.skin, self.characteristics, self.contact)
-        if min(weights) < 0 or self.band < 0 or self.iterations < 1 or self.contact_every < 1:
+        if min(weights) < 0 or self.band < 0 or self.whole < 0 or self.iterations < 1 or self.contact_every < 1:
             raise ReenactError("physics: expected weights that are not negative and at least one iteration")
         if max(self.elasticity, self.volume, self.muscle) == 0 or self.skin == 0:
             raise ReenactError("physics: expected a weight for the skin and one for tissue, got 0; drop the physics")
@@ -296,6 +301,8 @@ class FacePhysics:
             clock("tissue")
             state[self._free] = self._factor.solve(fixed + sides[self._free])
             clock("solve")
+        self._keep_whole(state)
+        clock("solve")
         if config.contact > 0:
             loose = ~shell.border[:count]
             for _ in range(config.clean):
@@ -305,6 +312,23 @@ class FacePhysics:
                 state[:count][loose] += pushed[loose]
             clock("contact")
         return state
+
+    def _keep_whole(self, state: Float[ndarray, "X 3"]) -> None:
+        """Bring the volume of all tissue into its band, in place, where that costs the other terms least.
+
+        Newton's steps on the volume along K^-1 dV/dX, the direction of a Lagrange multiplier; K is the matrix of the
+        solve. Source: ours.
+        """
+        shell, count = self.shell, len(state)
+        whole = shell.volumes.sum()
+        for _ in range(3):
+            ratio = tet_volumes(state, shell.tets).sum() / whole
+            missing = np.clip(ratio, 1 - self.config.whole, 1 + self.config.whole) - ratio
+            if abs(missing) < 1e-5:
+                return
+            slopes = volume_gradient(state, shell.tets, count)[self._free]
+            direction = self._factor.solve(slopes)
+            state[self._free] += missing * whole / (slopes * direction).sum() * direction
 
     def _posed(self, mesh: ndarray, state: ndarray, skin: ndarray) -> Float[ndarray, "V 3"]:
         """The mesh of the rig with its skin where the nodes are."""

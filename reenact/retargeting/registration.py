@@ -328,7 +328,7 @@ def _need(source: Rig, target: Rig, pairs: Pairs) -> None:
     if len(pairs) < 4:
         raise ReenactError(
             f"{source.name} and {target.name}: expected at least four shapes that move both faces alike, found "
-            f"{len(pairs)}; give a file of pairs of places (`correspondence`), or train on pictures alone (pairs.method)"
+            f"{len(pairs)}; give a file of pairs of places (correspondence), or train on pictures alone (pairs.method)"
         )
 
 

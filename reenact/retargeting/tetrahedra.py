@@ -19,6 +19,14 @@ def tet_volumes(points: Float[ndarray, "X 3"], tets: Int[ndarray, "M 4"]) -> Flo
     return np.einsum("mi,mi->m", np.cross(b - a, c - a), d - a) / 6
 
 
+def volume_gradient(points: Float[ndarray, "X 3"], tets: Int[ndarray, "M 4"], count: int) -> Float[ndarray, "X 3"]:
+    """How the sum of all volumes grows as each of `count` points moves."""
+    a, b, c, d = points[tets].swapaxes(0, 1)
+    slopes = np.stack([np.cross(c - d, b - d), np.cross(a - d, c - d), np.cross(b - d, a - d)], 1) / 6
+    slopes = np.concatenate([slopes, -slopes.sum(1, keepdims=True)], 1)
+    return np.stack([np.bincount(tets.ravel(), slopes[..., i].ravel(), count) for i in range(3)], 1)
+
+
 def hat_gradients(points: Float[ndarray, "X 3"], tets: Int[ndarray, "M 4"]) -> Float[ndarray, "M 4 3"]:
     """Gradient of each corner's hat function."""
     corners = points[tets]
