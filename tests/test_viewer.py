@@ -21,12 +21,15 @@ import pytest
 import safetensors.numpy
 import torch
 
+from reenact.checkpoint import newest_step, save_checkpoint
 from reenact.errors import ReenactError
+from reenact.inference import ImageRetargeter
 from reenact.nudges import FORMAT, Nudge, Nudges, corrected, labels, load_nudges, save_nudges
 from reenact.portrait import Portrait
 from reenact.rigs import motion
 from reenact.rigs.clip import Clip
 from reenact.rigs.files import load_rig, read_clip, save_rig
+from reenact.run import Run
 from reenact.viewer.server import Server
 from reenact.viewer.session import Session
 
@@ -216,10 +219,35 @@ def test_a_run_brings_its_networks_and_keeps_its_nudges(toy_run):
     assert session.nudges_path == toy_run.folder / "nudges.json"
     made = torch.cat(list(session.track("egg", session.first_method["egg"])))
     assert made.shape == (30, 7)
-    from reenact.inference import ImageRetargeter
-
     assert torch.allclose(made, ImageRetargeter.load(toy_run.folder)(session.clip).weights)
     assert torch.cat(list(session.track("egg", "pairs"))).shape == (30, 7)
+
+
+def test_a_run_without_a_checkpoint_is_opened_and_says_when_the_first_is_due(toy_config, tmp_path):
+    config = replace(toy_config, run=str(tmp_path / "run"))
+    run = Run.create(config)
+    session = Session.open([str(run.folder)], "synthetic:1:1")
+    assert session.first_method["egg"] == "networks"
+    assert session.describe()["run"] == {"folder": str(run.folder), "checkpoint": None}
+    with pytest.raises(ReenactError, match="run: no checkpoint yet; the first is due at step 5"):
+        next(session.track("egg", "networks"))
+    assert torch.cat(list(session.track("egg", "truth"))).any()
+
+
+def test_a_newer_checkpoint_takes_the_place_of_the_one_before(toy_config, tmp_path):
+    run = Run.create(replace(toy_config, run=str(tmp_path / "run")))
+    session = Session.open([str(run.folder)], "synthetic:1:1")
+    for step in (5, 10):
+        networks = run.networks()
+        for bpnet in networks.bpnets.values():
+            list(bpnet.parameters())[-1].data.fill_(step / 20)  # what the last layer adds to everything
+        tensors = {f"networks.{name}": tensor for name, tensor in networks.state_dict().items()}
+        save_checkpoint(run.folder, step, tensors, {})
+        made = torch.cat(list(session.track("egg", "networks")))
+        assert torch.equal(made, ImageRetargeter.load(run.folder)(session.clip).weights)
+        assert session.describe()["run"]["checkpoint"] == step
+        made_before = made if step == 5 else made_before
+    assert float((made - made_before).abs().max()) > 0.01
 
 
 def test_an_animated_file_plays_what_it_holds(toy_pair, tmp_path):
@@ -402,6 +430,9 @@ def test_weights_come_as_float32_and_a_pose_is_retargeted(server):
         ("/track/1", None, 404, "expected an address"),
         ("/texture/0", None, 422, "expected a rig with a texture"),
         ("/audio.wav", None, 404, "expected an address"),
+        ("/progress.json", None, 404, "expected an address"),
+        ("/preview/5", None, 422, "run: expected the folder of one"),
+        ("/preview/..%2f5", None, 404, "expected an address"),
         ("/retarget/1/truth", b"123", 400, "expected rows of 7 numbers"),
         ("/retarget/1/truth", b"", 400, "expected rows of 7 numbers"),
         ("/retarget/1/truth", np.full(7, np.nan, "<f4").tobytes(), 400, "sound numbers"),
@@ -892,6 +923,49 @@ def test_reduced_motion_switches_transitions_off(chromium, built_in):
     assert set(durations) == {"0s"}
     assert not opened.page.evaluate("viewer.state.playing")
     opened.page.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
+def test_a_training_beside_the_page_is_followed(chromium, toy_config, tmp_path):
+    training = replace(toy_config.training, steps=100_000, save_every=60, refresh=1000)
+    run = Run.create(replace(toy_config, run=str(tmp_path / "run"), training=training))
+    text = "document.getElementById('training-text').textContent"
+    with serving(Session.open([str(run.folder)], "synthetic:1:1")) as server:
+        opened = Opened(chromium, server)
+        assert opened.page.locator(".cell .note").all_text_contents() == ["", "Rests until the first checkpoint"]
+        assert opened.page.evaluate("viewer.state.cells[1].weights.every((weight) => weight === 0)")
+        opened.wait(f"{text}.startsWith('Training stopped at step 0 of 100,000')")
+        command = [sys.executable, "-m", "reenact.cli", "train", "--run", str(run.folder), "--resume"]
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.DEVNULL,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+        try:
+            opened.wait("viewer.training.shown >= 60")
+            first = opened.page.evaluate("viewer.training.shown")
+            opened.wait(f"{text}.startsWith('Training networks · step ') && {text}.includes(' left · faces by step ')")
+            assert opened.page.locator("#training").evaluate("each => each.open")
+            opened.wait(f"viewer.training.shown > {first}")
+            opened.wait("document.getElementById('preview-small').naturalWidth > 0")
+            names = [each.split()[0] for each in opened.page.locator("#loss-names li").all_text_contents()]
+            assert names[0] == "sum"
+            assert {"reconstruction", "pairs", "read"} <= set(names)
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(60)
+        opened.wait(f"{text}.startsWith('Training stopped')")
+        opened.wait(f"viewer.training.shown === {newest_step(run.folder)}")
+        shown = np.array(opened.page.evaluate("[...viewer.state.cells[1].track.weights]"), dtype=np.float32)
+        networks = ImageRetargeter.load(run.folder)(server.session.clip).weights
+        np.testing.assert_allclose(shown.reshape(-1, 7), networks, atol=1e-6)  # of the last checkpoint, as float32
+        assert float(networks.std()) > 0
+        opened.page.get_by_role("button", name="Enlarge the picture").click()
+        assert opened.page.locator("#preview-large").evaluate("each => each.naturalWidth") > 0
+        opened.page.keyboard.press("Escape")
+        assert opened.said == []
+        assert [url for url in opened.asked if not url.startswith(server.url)] == []
+        opened.page.close()
 
 
 def test_sound_plays_along(chromium, toy_pair, tmp_path):
