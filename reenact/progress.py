@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +15,9 @@ from reenact.training import parsed_line, planned_steps
 
 _POINTS = 300
 """Points of a curve at most; each is the mean of what lies around it."""
-_RECENT = 10
-"""Lines of metrics.jsonl that tell how fast it goes."""
+_RECENT, _LONG = 10, 100
+"""Lines of metrics.jsonl that tell how fast steps are; and how long the rest takes, as some hold the rendering of new
+expressions. So does the first, which tells of neither."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Progress:
     """Steps of all stages, of `total`."""
     total: int
     steps_per_second: float | None
-    """Over the last few hundred steps; None before the first."""
+    """Over the last two hundred steps, the rendering of new expressions left out; None before the first."""
     seconds_left: float | None
     """For all stages, should they go on like this; None unless it trains."""
     checkpoint: int | None
@@ -57,8 +59,9 @@ def read_progress(run: Run) -> Progress:
     total, lines = sum(plan.values()), _lines(folder / "metrics.jsonl", plan)
     stage, step = (lines[-1][0], lines[-1][1]) if lines else (next(iter(plan)), 0)
     done, saved = before[stage] + step, newest_step(folder)
-    recent = [numbers["steps_per_second"] for *_, numbers in lines[-_RECENT:] if numbers.get("steps_per_second", 0) > 0]
-    speed = len(recent) / sum(1 / each for each in recent) if recent else None  # each speaks of as many steps
+    speeds = [numbers["steps_per_second"] for *_, numbers in lines if numbers.get("steps_per_second", 0) > 0]
+    known = speeds[1:] or speeds
+    pace = statistics.harmonic_mean(known[-_LONG:]) if known else None  # for each speaks of as many steps
     state = "finished" if saved == total else "training" if is_training(folder) else "stopped"
     every = run.config.training.save_every
     due = before[stage] + min(plan[stage], (step // every + 1) * every)
@@ -69,8 +72,8 @@ def read_progress(run: Run) -> Progress:
         steps=plan[stage],
         done=done,
         total=total,
-        steps_per_second=speed,
-        seconds_left=(total - done) / speed if speed and state == "training" else None,
+        steps_per_second=statistics.median(known[-_RECENT:]) if known else None,
+        seconds_left=(total - done) / pace if pace and state == "training" else None,
         checkpoint=saved,
         next_checkpoint=due,
         previews=sorted(int(path.stem) for path in (folder / "previews").glob("*.png") if path.stem.isdecimal()),
