@@ -24,6 +24,7 @@ from torch import Tensor
 
 from reenact.checkpoint import newest_step
 from reenact.errors import ReenactError
+from reenact.geometry import outward_faces
 from reenact.nudges import Nudges, load_nudges, parse_nudges, save_nudges
 from reenact.portrait import CAMERA_DISTANCE, HALF_HEIGHT, Portrait
 from reenact.progress import preview_file, read_progress
@@ -185,10 +186,10 @@ class Session:
     def geometry(self, key: str) -> bytes:
         """A rig as safetensors, framed as its portrait frames it, so that a metre is one of an adult's face.
 
-        `neutral` (V, 3), `faces` (F, 3), `colors` (V, 3) bytes of sRGB; shape k moves the vertices
-        `shape_vertices[shape_starts[k]:shape_starts[k + 1]]` by the same rows of `shape_offsets`. With a texture, which
-        cuts the surface along seams, `corners` are the vertices of what is drawn, `uv` where they lie in the texture,
-        and `triangles` index both.
+        `neutral` (V, 3), `faces` (F, 3), `outward` (F,) 1 where backs cannot be seen, `colors` (V, 3) bytes of sRGB;
+        shape k moves the vertices `shape_vertices[shape_starts[k]:shape_starts[k + 1]]` by the same rows of
+        `shape_offsets`. With a texture, which cuts the surface along seams, `corners` are the vertices of what is
+        drawn, `uv` where they lie in the texture, and `triangles` index both.
         """
         with self._geometry_lock:  # not the other: a page opens while a method is prepared
             if key not in self._geometry:
@@ -421,6 +422,7 @@ def _packed(rig: Rig) -> bytes:
     arrays = {
         "neutral": (scale * rig.neutral + position).numpy().astype(np.float32),
         "faces": rig.faces.numpy().astype(np.uint32),
+        "outward": outward_faces(rig.neutral.double().numpy(), rig.faces.numpy()).astype(np.uint8),
         "colors": (colors.numpy() * 255).round().clip(0, 255).astype(np.uint8),
         "shape_starts": np.concatenate([[0], moved.sum(1).cumsum()]).astype(np.uint32),
         "shape_vertices": np.nonzero(moved)[1].astype(np.uint32),
