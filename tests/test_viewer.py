@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 import torch
+from accessibility import nameless, poor_contrast, tab_stops
 from PIL import Image
 
 from reenact.checkpoint import newest_step, save_checkpoint
@@ -854,38 +855,19 @@ def test_a_method_that_cannot_work_says_why_on_the_page(chromium, toy_pair):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_everything_has_a_name_and_text_has_contrast(chromium, built_in, scheme):
+def test_everything_has_a_name_text_has_contrast_and_the_focus_is_seen(chromium, built_in, scheme):
     opened = Opened(chromium, built_in, color_scheme=scheme)
-    nameless = opened.page.evaluate("""() => [...document.querySelectorAll('button, input, select, canvas, dialog')]
-        .filter((each) => !(each.textContent.trim() && each.tagName === 'BUTTON') && !each.ariaLabel
-            && !each.labels?.length && !each.getAttribute('aria-labelledby')).map((each) => each.outerHTML)""")
-    assert nameless == []
-    # WCAG 2.2, 1.4.3: text against the nearest background that is not clear, at least 4.5 to 1.
-    poor = opened.page.evaluate("""() => {
-        const pen = document.createElement('canvas').getContext('2d', { willReadFrequently: true });
-        const rgb = (color) => { pen.clearRect(0, 0, 1, 1); pen.fillStyle = color; pen.fillRect(0, 0, 1, 1);
-            return [...pen.getImageData(0, 0, 1, 1).data]; };
-        const light = (color) => { const [r, g, b] = color.map((c) => c / 255)
-            .map((c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4));
-            return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
-        const behind = (each) => { for (let e = each; e; e = e.parentElement) {
-            const color = rgb(getComputedStyle(e).backgroundColor); if (color[3] > 250) return color; }
-            return rgb('white'); };
-        const found = [];
-        for (const each of document.querySelectorAll('body *')) {
-            const text = [...each.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim());
-            if (!text || each.closest('script, style, option, dialog, :disabled, [hidden], .unseen')) continue;
-            const a = light(rgb(getComputedStyle(each).color)), b = light(behind(each));
-            const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
-            if (ratio < 4.5) found.push([each.textContent.trim().slice(0, 30), ratio.toFixed(2)]);
-        }
-        return found; }""")
-    assert poor == []
-    opened.page.keyboard.press("Tab")
-    style = opened.page.evaluate(
-        "(() => { const s = getComputedStyle(document.activeElement); return [s.outlineStyle, s.outlineWidth]; })()"
-    )
-    assert style == ["solid", "2px"]
+    assert nameless(opened.page) == []
+    assert poor_contrast(opened.page) == []
+    stops = tab_stops(opened.page)
+    assert [name for name, seen in stops if not seen] == []
+    names = [name for name, _ in stops]
+    # By the way of reading: above the faces, on them, below them, beside them.
+    order = [
+        names.index(name) for name in ("view", "Method for anny:toon", "play", "scrub", "which", "search", "radius")
+    ]
+    assert order == sorted(order)
+    assert sum(name.startswith("shape-") for name in names) == 52
     opened.page.close()
 
 
