@@ -57,7 +57,7 @@ h1 { margin: .4rem 0; flex: 1; }
 button { font: inherit; color: inherit; background: none; border: 1px solid var(--soft); border-radius: 8px;
   padding: .3rem 1rem; cursor: pointer; }
 :focus-visible { outline: 2px solid var(--link); outline-offset: 2px; }
-div { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(150px, 45%), 1fr)); gap: 1rem; }
+div { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(140px, 45%), 1fr)); gap: 1rem; }
 figure { margin: 0; } canvas { width: 100%; aspect-ratio: 1; border-radius: 10px; display: block; background: #5c6169; }
 figcaption { font-size: .85rem; color: var(--soft); margin-top: .3rem; } figcaption b { color: var(--ink); }
 h2 { margin: 2.2rem 0 .2rem; } p { margin: 0 0 .8rem; max-width: 74ch; color: var(--soft); }

@@ -142,6 +142,7 @@ def train(config: Config, resume: bool = False) -> Path:
         with RunLock(run.folder) as lock:
             if resume:
                 migrate(run.folder, run.config)
+            console.print(f"To watch it, elsewhere: reenact view {_quoted(run)}", soft_wrap=True)
             _train(run, resume, lock, interrupts, console)
     _say_next(console, run)
     return run.folder
@@ -795,6 +796,7 @@ def _say_next(console: Console, run: Run) -> None:
     console.print(f"Trained: {run.folder}", soft_wrap=True)
     console.print(f"  reenact infer {_quoted(run)} CLIP --out result.glb", soft_wrap=True)
     console.print(f"  reenact evaluate {_quoted(run)}", soft_wrap=True)
+    console.print(f"  reenact view {_quoted(run)}", soft_wrap=True)
 
 
 def _quoted(run: Run) -> str:
