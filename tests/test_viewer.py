@@ -932,6 +932,7 @@ def test_a_training_beside_the_page_is_followed(chromium, toy_config, tmp_path):
             names = [each.split()[0] for each in opened.page.locator("#loss-names li").all_text_contents()]
             assert names[0] == "sum"
             assert {"reconstruction", "pairs", "read"} <= set(names)
+            assert nameless(opened.page) == poor_contrast(opened.page) == []
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(60)
