@@ -15,7 +15,7 @@ import io
 import os
 import sys
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch starts: its idle threads would spin on our cores
@@ -41,52 +41,95 @@ from reenact.rigs.timeline import resampled
 SOURCE, SHOWN = "anny:man", "anny:toon"
 BESIDE = ("shape-matching", "consensus", "delta-transfer", "deformation-transfer", "rbf", "ribera-paper", "copy")
 """Methods that the second section compares."""
-SIZE, FPS = 192, 12.0
+SIZE, FPS, COLUMNS = 192, 15.0, 10
+SEED = 268  # smiles, speaks, blinks and raises its brows within four seconds
 
 PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>Gallery · Reenact</title><style>
-:root { color-scheme: light dark; --paper: #f6f5f2; --ink: #1b1d22; --soft: #585d68; }
-@media (prefers-color-scheme: dark) { :root { --paper: #14161a; --ink: #eceae5; --soft: #a3a8b3; } }
+:root { color-scheme: light dark; --paper: #f6f5f2; --ink: #1b1d22; --soft: #585d68; --link: #2563a8; }
+@media (prefers-color-scheme: dark) { :root { --paper: #14161a; --ink: #eceae5; --soft: #a3a8b3; --link: #7db8f5; } }
+@media print { button { display: none; } figure { break-inside: avoid; } }
 body { margin: 0 auto; padding: 1.5rem; max-width: 1120px; background: var(--paper); color: var(--ink);
   font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; }
-div { display: grid; grid-template-columns: repeat(auto-fill, minmax(150px, 1fr)); gap: 1rem; }
-figure { margin: 0; } img { width: 100%; aspect-ratio: 1; border-radius: 10px; display: block; background: #5c6169; }
+header { position: sticky; top: 0; z-index: 1; display: flex; align-items: center; background: var(--paper); }
+h1 { margin: .4rem 0; flex: 1; }
+button { font: inherit; color: inherit; background: none; border: 1px solid var(--soft); border-radius: 8px;
+  padding: .3rem 1rem; cursor: pointer; }
+:focus-visible { outline: 2px solid var(--link); outline-offset: 2px; }
+div { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(140px, 45%), 1fr)); gap: 1rem; }
+figure { margin: 0; } canvas { width: 100%; aspect-ratio: 1; border-radius: 10px; display: block; background: #5c6169; }
 figcaption { font-size: .85rem; color: var(--soft); margin-top: .3rem; } figcaption b { color: var(--ink); }
 h2 { margin: 2.2rem 0 .2rem; } p { margin: 0 0 .8rem; max-width: 74ch; color: var(--soft); }
 </style></head><body>
-<h1>Gallery</h1>
+<header><h1>Gallery</h1><button type="button" id="play">Pause</button></header>
 {% for section in sections %}<h2>{{ section.title }}</h2><p>{{ section.note }}</p>
-<div>{% for face in section.faces %}<figure><picture>
-<source media="(prefers-reduced-motion: reduce)" srcset="{{ face.still }}">
-<img src="{{ face.moving }}" alt="{{ face.title }}, {{ face.note }}"></picture>
+<div>{% for face in section.faces %}<figure>
+<canvas width="{{ size }}" height="{{ size }}" role="img" aria-label="{{ face.title }}, {{ face.note }}"
+data-frames="{{ face.frames | length }}" data-liveliest="{{ face.liveliest }}" data-sheet="{{ face.sheet }}"></canvas>
 <figcaption><b>{{ face.title }}</b><br>{{ face.note }}</figcaption></figure>{% endfor %}</div>
-{% endfor %}</body></html>
+{% endfor %}<script type="module">
+// One clock for all, so that faces beside each other are at the same frame.
+const FPS = {{ fps }}, COLUMNS = {{ columns }}, SIZE = {{ size }}, button = document.getElementById("play");
+const faces = await Promise.all([...document.querySelectorAll("canvas")].map(async (canvas) => {
+  const image = new Image();
+  image.src = canvas.dataset.sheet;
+  await image.decode();
+  return { pen: canvas.getContext("2d"), image, count: +canvas.dataset.frames, liveliest: +canvas.dataset.liveliest };
+}));
+let playing = !matchMedia("(prefers-reduced-motion: reduce)").matches, time = 0, before = performance.now();
+const show = ({ pen, image }, n) => pen.drawImage(
+  image, (n % COLUMNS) * SIZE, Math.floor(n / COLUMNS) * SIZE, SIZE, SIZE, 0, 0, SIZE, SIZE);
+function tick(now) {
+  time += (now - before) / 1000;
+  before = now;
+  for (const face of faces) show(face, Math.floor(time * FPS) % face.count);
+  if (playing) requestAnimationFrame(tick);
+}
+function play(on) {
+  playing = on;
+  button.textContent = on ? "Pause" : "Play";
+  before = performance.now();
+  if (on) requestAnimationFrame(tick);
+}
+for (const face of faces) show(face, face.liveliest);
+button.addEventListener("click", () => play(!playing));
+play(playing);
+</script></body></html>
 """
 
 
 @dataclass(frozen=True)
 class Face:
-    """A face that moves, as a picture in the page."""
+    """A face that moves."""
 
     title: str
     note: str
-    moving: str
-    still: str
     frames: tuple[Image.Image, ...]
+    liveliest: int
+    """The frame to show where nothing should move."""
+    sheet: str
+    """All frames in rows of `COLUMNS`."""
 
 
 @torch.no_grad()
 def face(title: str, note: str, rig: Rig, clip: Clip) -> Face:
-    """The clip on the rig as an animated WebP, and its liveliest frame."""
+    """The clip on the rig, drawn."""
     portrait, pictures = Portrait.of(rig), []
     for part in resampled(clip, FPS).weights.float().split(16):
         drawn = portrait.render(rig.vertices(part), SIZE)["color"].clamp(0, 1)
         pictures += [Image.fromarray(each) for each in (255 * drawn.movedim(1, -1)).round().byte().numpy()]
-    most = pictures[int(resampled(clip, FPS).weights.sum(1).argmax())]
-    single = io.BytesIO()
-    most.save(single, "WEBP", quality=80)
-    return Face(title, note, _uri(_moving(pictures)), _uri(single.getvalue()), tuple(pictures))
+    liveliest = int(resampled(clip, FPS).weights.sum(1).argmax())
+    return Face(title, note, tuple(pictures), liveliest, _sheet(pictures))
+
+
+def _sheet(pictures: list[Image.Image]) -> str:
+    whole = Image.new("RGB", (COLUMNS * SIZE, -(-len(pictures) // COLUMNS) * SIZE))
+    for place, picture in enumerate(pictures):
+        whole.paste(picture, (place % COLUMNS * SIZE, place // COLUMNS * SIZE))
+    packed = io.BytesIO()
+    whole.save(packed, "WEBP", quality=70)
+    return f"data:image/webp;base64,{base64.b64encode(packed.getvalue()).decode()}"
 
 
 def _moving(pictures: list[Image.Image]) -> bytes:
@@ -97,7 +140,15 @@ def _moving(pictures: list[Image.Image]) -> bytes:
     return packed.getvalue()
 
 
-def strip(faces: list[Face], size: int = 140) -> bytes:
+def going_round(clip: Clip, seconds: float = 0.4) -> Clip:
+    """The clip from rest to rest, as its picture starts again where it ends."""
+    places = torch.arange(len(clip))
+    near = torch.minimum(places, len(clip) - 1 - places) / (seconds * clip.fps)  # the nearer end
+    share = (1 - torch.cos(torch.pi * near.clamp(max=1))) / 2
+    return replace(clip, weights=clip.weights * share[:, None])
+
+
+def strip(faces: list[Face], size: int = 180) -> bytes:
     """The faces side by side, in step."""
     wholes = []
     for moment in zip(*(each.frames for each in faces), strict=True):
@@ -108,8 +159,10 @@ def strip(faces: list[Face], size: int = 140) -> bytes:
     return _moving(wholes)
 
 
-def _uri(data: bytes) -> str:
-    return f"data:image/webp;base64,{base64.b64encode(data).decode()}"
+def page_of(sections: list[dict]) -> str:
+    """The page: sections with a title, a note and faces."""
+    template = jinja2.Environment(autoescape=True).from_string(PAGE)
+    return template.render(sections=sections, size=SIZE, fps=FPS, columns=COLUMNS)
 
 
 def everyone(trained: dict[str, ImageRetargeter], clip: Clip, source: Rig, say) -> list[Face]:
@@ -157,7 +210,7 @@ def main() -> None:
         made = ImageRetargeter.load(folder)
         if made.source.name == SOURCE:
             trained[made.target.name] = made
-    clip = motion.synthesize(source.names, arguments.seconds, seed=2027, kind="mixed")
+    clip = going_round(motion.synthesize(source.names, arguments.seconds, seed=SEED, kind="mixed"))
     console = Console(stderr=True)
     with console.status("") as status:
         shown = everyone(trained, clip, source, status.update)
@@ -183,9 +236,8 @@ def main() -> None:
                 ],
             },
         ]
-    page = jinja2.Environment(autoescape=True).from_string(PAGE).render(sections=sections)
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(arguments.out, page.encode())
+    write_atomically(arguments.out, page_of(sections).encode())
     print(arguments.out)
 
 

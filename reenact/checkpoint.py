@@ -114,6 +114,12 @@ def has_checkpoint(run_dir: Path) -> bool:
     return bool(_checkpoints(run_dir))
 
 
+def newest_step(run_dir: Path) -> int | None:
+    """Steps of the checkpoint that `load_checkpoint` tries first; None before the first."""
+    paths = _newest_first(run_dir)
+    return _step(paths[0]) if paths else None
+
+
 def save_tensors(tensors: dict[str, Tensor], path: Path) -> None:
     """Write named tensors alone, as safetensors, atomically.
 
@@ -414,6 +420,16 @@ class RunLock:
             f"{self.run_dir}: expected no other process to train here, got process {process}{owner} on {machine}"
             f"{heard}; wait for it, end it, or choose another run folder"
         )
+
+
+def is_training(run_dir: Path) -> bool:
+    """Whether a process seems to train in a run folder; looks, and takes no lock."""
+    path = run_dir / "lock"
+    try:
+        holder, touched = _parse(path.read_bytes()), path.stat().st_mtime
+    except OSError:
+        return False
+    return _alive(holder) and (holder.get("host") == socket.gethostname() or time.time() - touched < _SILENCE)
 
 
 def _user() -> str:

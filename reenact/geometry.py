@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
 from reenact.errors import ReenactError
@@ -113,6 +113,32 @@ def mesh_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "E 2"]:
     """Pairs of different vertices that a face joins, the lower index first, each once and in order."""
     edges = np.unique(np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0)
     return edges[edges[:, 0] != edges[:, 1]]
+
+
+def outward_faces(
+    points: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], open_share: float = 0.05
+) -> Bool[np.ndarray, "F"]:
+    """Faces whose backs nobody sees from outside: of connected surfaces that enclose a volume and are wound outwards.
+
+    Args:
+        points: Positions.
+        faces: Of any number of surfaces.
+        open_share: Of a surface's edges, as many may lie at a hole (a head ends at the neck) or be wound wrongly.
+    """
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    graph = sparse.coo_array((np.ones(len(edges)), edges.T), shape=(len(points), len(points)))
+    count, surface = connected_components(graph, directed=False)  # by vertex
+    forth, back = edges @ [len(points), 1], edges @ [1, len(points)]
+    known, times = np.unique(forth, return_counts=True)
+    place = np.searchsorted(known, back).clip(max=len(known) - 1)
+    paired = (known[place] == back) & (times[place] == 1)  # exactly one neighbour runs along it the other way
+    of_edge, of_face = surface[edges[:, 0]], surface[faces[:, 0]]
+    gaps = np.bincount(of_edge, ~paired, count) / np.bincount(of_edge, minlength=count).clip(min=1)
+    middle = np.stack([np.bincount(surface, points[:, axis], count) for axis in range(3)], axis=1)
+    middle /= np.bincount(surface, minlength=count)[:, None]
+    corners = points[faces] - middle[of_face, None]  # (F, 3, 3)
+    volume = np.bincount(of_face, np.linalg.det(corners), count)  # six times that of tetrahedra around the middle
+    return ((gaps <= open_share) & (volume > 0))[of_face]
 
 
 def edge_graph(points: Float[np.ndarray, "V 3"], edges: Int[np.ndarray, "E 2"]) -> sparse.csr_array:

@@ -8,6 +8,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from reenact.atomic import replacing
 from reenact.data import Studio
 from reenact.models import Networks
 from reenact.rigs import arkit, motion
@@ -65,4 +66,5 @@ def save_contact_sheet(path: Path, columns: list[Tensor]) -> None:
     sheet = torch.cat([torch.cat(list(column), dim=1) for column in sized], dim=2)  # (3, rows H, columns W)
     pixels = (sheet.permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
     path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(pixels).save(path)
+    with replacing(path) as whole:  # a viewer may be looking
+        Image.fromarray(pixels).save(whole, format="PNG")

@@ -142,6 +142,7 @@ def train(config: Config, resume: bool = False) -> Path:
         with RunLock(run.folder) as lock:
             if resume:
                 migrate(run.folder, run.config)
+            console.print(f"To watch it, elsewhere: reenact view {_quoted(run)}", soft_wrap=True)
             _train(run, resume, lock, interrupts, console)
     _say_next(console, run)
     return run.folder
@@ -272,13 +273,13 @@ def _stages(shop: _Workshop) -> list[_Stage]:
     def render_all(seed: list[int]) -> dict[str, _Pool]:
         return {key: _render(shop, key, seed, keys) for key in keys}
 
-    steps = _step_count(training.steps, training.epochs, training.frames, training.batch_size)
+    steps = planned_steps(shop.config, keys)
     if training.together:
         return [
             _Stage(
                 "networks",
                 shop.networks,
-                steps,
+                steps["networks"],
                 training.learning_rate,
                 render_all,
                 lambda pools, random: _draw(pools, training.batch_size, random),
@@ -289,7 +290,7 @@ def _stages(shop: _Workshop) -> list[_Stage]:
         _Stage(
             "reenactnet",
             shop.networks.reenactnet,
-            steps,
+            steps["reenactnet"],
             training.learning_rate,
             render_all,
             lambda pools, random: _draw(pools, training.batch_size, random),
@@ -302,7 +303,7 @@ def _stages(shop: _Workshop) -> list[_Stage]:
             _Stage(
                 f"bpnet.{key}",
                 shop.networks.bpnets[key],
-                _step_count(bpnet.steps, bpnet.epochs, training.frames, bpnet.batch_size),
+                steps[f"bpnet.{key}"],
                 bpnet.learning_rate,
                 lambda seed, key=key, others=others: {
                     key: _render(shop, key, seed, []),
@@ -502,6 +503,16 @@ def _bpnet_losses(
     return losses
 
 
+def planned_steps(config: Config, keys: list[str]) -> dict[str, int]:
+    """Steps of each stage of a training of these rigs, in their order."""
+    training, bpnet = config.training, config.bpnet
+    steps = _step_count(training.steps, training.epochs, training.frames, training.batch_size)
+    if training.together:
+        return {"networks": steps}
+    each = _step_count(bpnet.steps, bpnet.epochs, training.frames, bpnet.batch_size)
+    return {"reenactnet": steps, **{f"bpnet.{key}": each for key in keys}}
+
+
 def _step_count(steps: int, epochs: float | None, frames: int, batch_size: int) -> int:
     """Steps, or as many as make the epochs over a fixed set."""
     if epochs is None:
@@ -593,7 +604,7 @@ def _restore(run: Run, networks: Networks, stages: list[_Stage]) -> tuple[int, i
     return stage, step, optimizer
 
 
-def _parsed(text: str) -> dict[str, Any] | None:
+def parsed_line(text: str) -> dict[str, Any] | None:
     """A line of metrics.jsonl, or None where a power cut or a full disk tore it."""
     try:
         line = json.loads(text)
@@ -615,7 +626,7 @@ class _Log:
         self.recent: dict[str, float] = {}
         self.started, self.step, self.last = time.perf_counter(), step, step
         if path.exists():
-            lines = [line for text in path.read_text(errors="replace").splitlines() if (line := _parsed(text))]
+            lines = [line for text in path.read_text(errors="replace").splitlines() if (line := parsed_line(text))]
             kept = [line for line in lines if line["stage"] != stage or line["step"] <= step]
             write_atomically(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
 
@@ -787,6 +798,7 @@ def _say_next(console: Console, run: Run) -> None:
     console.print(f"Trained: {run.folder}", soft_wrap=True)
     console.print(f"  reenact infer {_quoted(run)} CLIP --out result.glb", soft_wrap=True)
     console.print(f"  reenact evaluate {_quoted(run)}", soft_wrap=True)
+    console.print(f"  reenact view {_quoted(run)}", soft_wrap=True)
 
 
 def _quoted(run: Run) -> str:

@@ -8,6 +8,7 @@ from reenact.geometry import (
     closest_points,
     closest_points_around,
     farthest_points,
+    outward_faces,
     rigid_fit,
     similarity_fit,
     vertex_normals,
@@ -24,6 +25,20 @@ def random_rotation(seed):
 
 def random_points(count, seed):
     return torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+
+
+def test_only_surfaces_that_enclose_something_and_are_wound_outwards_hide_their_backs():
+    ball = trimesh.creation.icosphere(subdivisions=3)  # 1,280 faces
+    head = ball.faces[ball.triangles_center[:, 1] > -0.98]  # open at the neck
+    dish = ball.faces[ball.triangles_center[:, 1] > 0.9]
+    surfaces = [ball.faces, head, ball.faces[:, ::-1], dish, OUTSIDE.numpy()]
+    points = [ball.vertices] * 4 + [TETRAHEDRON.numpy()]
+    places = np.cumsum([0, *map(len, points)])
+    faces = np.concatenate([surface + place for surface, place in zip(surfaces, places)])
+    hidden = outward_faces(np.concatenate(points), faces)
+    parts = np.split(hidden, np.cumsum([len(surface) for surface in surfaces])[:-1])
+    assert 0 < len(ball.faces) - len(head) < 30
+    assert [set(part.tolist()) for part in parts] == [{True}, {True}, {False}, {False}, {True}]
 
 
 def test_normals_of_a_corner_of_a_cube_are_its_diagonal():

@@ -10,6 +10,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 import torch
+from accessibility import nameless, poor_contrast, tab_stops
 from PIL import Image
 
 from reenact import evaluation, report
@@ -331,6 +332,24 @@ def test_in_a_browser_nothing_is_wider_than_the_page(run, page, opened, context)
     shown = opened(run[0] / "report.html", **context)
     wide, window = shown.evaluate("[document.documentElement.scrollWidth, innerWidth]")
     assert wide <= window
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_in_a_browser_everything_has_a_name_text_has_contrast_and_the_focus_is_seen(run, page, opened, scheme):
+    shown = opened(run[0] / "report.html", color_scheme=scheme)
+    assert nameless(shown) == []
+    assert poor_contrast(shown) == []
+    stops = tab_stops(shown)
+    assert len(stops) >= 4
+    assert [name for name, seen in stops if not seen] == []
+
+
+def test_in_a_browser_the_player_moves_by_itself_unless_motion_is_to_be_reduced(run, page, opened):
+    for wish in ("reduce", "no-preference"):
+        shown = opened(run[0] / "report.html", reduced_motion=wish)
+        shown.wait_for_timeout(700)
+        label = shown.locator(".transport button").first.get_attribute("aria-label")
+        assert label == {"reduce": "Play", "no-preference": "Pause"}[wish]
 
 
 def test_the_same_page_from_the_command_line(run, page, monkeypatch, capsys):

@@ -312,7 +312,8 @@ def test_a_preview_that_fails_does_not_stop_the_training(toy_run, tmp_path):
 def test_the_commands_to_go_on_with_can_be_pasted(toy_run):
     said = io.StringIO()
     _say_next(Console(file=said, markup=False), replace(toy_run, folder=Path("my runs/[b]")))
-    assert "  reenact evaluate 'my runs/[b]'\n" in said.getvalue()
+    for command in ("evaluate", "view"):
+        assert f"  reenact {command} 'my runs/[b]'\n" in said.getvalue()
 
 
 def _in_compiled_code(interrupt):

@@ -141,6 +141,10 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(self.server.pages[path], _KINDS[path.rsplit(".", 1)[1]])
         elif parts == ["session.json"]:
             self._send(json.dumps(session.describe()).encode(), "application/json")
+        elif parts == ["progress.json"] and session.run is not None:
+            self._send(json.dumps(session.progress()).encode(), "application/json")
+        elif parts[0] == "preview" and len(parts) == 2 and re.fullmatch(r"[0-9]{1,12}", parts[1]):
+            self._send(session.preview(int(parts[1])), "image/png")
         elif parts == ["audio.wav"] and session.audio is not None:
             self._send_part(session.audio.read_bytes(), "audio/wav")
         elif parts[0] == "rig" and len(parts) == 2:

@@ -11,7 +11,7 @@ import tempfile
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,12 @@ from PIL import Image
 from safetensors.numpy import save
 from torch import Tensor
 
+from reenact.checkpoint import newest_step
 from reenact.errors import ReenactError
+from reenact.geometry import outward_faces
 from reenact.nudges import Nudges, load_nudges, parse_nudges, save_nudges
 from reenact.portrait import CAMERA_DISTANCE, HALF_HEIGHT, Portrait
+from reenact.progress import preview_file, read_progress
 from reenact.retargeting import METHODS
 from reenact.retargeting.correspondence import Correspondence, find_correspondence
 from reenact.rigs.clip import Clip
@@ -44,6 +47,8 @@ _MARKERS = 300
 _CHUNK = 256
 """Frames that are retargeted between two deliveries, where frames do not depend on each other."""
 _FRAME_BY_FRAME = ("networks", "pairs", "copy", "neutral")
+_TRAINED = ("networks", "pairs")
+"""Methods of a run, which ask for a checkpoint; a newer one replaces it while the page is open."""
 _STILL = 1e-6
 """Metres of an adult's face; what a shape moves less does not cross to the page."""
 _NEUTRAL_HEIGHT = 0.24
@@ -74,7 +79,7 @@ class Session:
             clip_name: As the user named it.
             files: Of the rigs that came from one, by key: exports animate the avatar itself, and what animation it
                 holds is a method of its own.
-            run: Trained on the first two rigs.
+            run: Trained on the first two rigs, or in training.
             method: Shown first on every target; the run's networks, or names, or shapes, unless said.
             audio: A .wav that plays along.
             nudges_path: Where corrections are kept, and read from if there are any.
@@ -91,7 +96,7 @@ class Session:
         self.rigs, self.clip, self.clip_name = rigs, clip, clip_name
         self.files, self.run, self.audio, self.nudges_path = files or {}, run, audio, nudges_path
         self.source, *self.targets = rigs
-        self._lock, self._made = threading.RLock(), {}
+        self._lock, self._made, self._trained_until = threading.RLock(), {}, None
         self._geometry_lock, self._geometry = threading.Lock(), {}
         self.methods = {key: self._methods(key) for key in self.targets}
         for key, known in self.methods.items():
@@ -171,6 +176,7 @@ class Session:
                 }
                 for key, rig in self.rigs.items()
             ],
+            "run": self.run and {"folder": str(self.run.folder), "checkpoint": newest_step(self.run.folder)},
             "audio": self.audio is not None,
             "exports": list(EXPORTS),
             "kept": None if self.nudges_path is None else str(self.nudges_path),
@@ -180,15 +186,34 @@ class Session:
     def geometry(self, key: str) -> bytes:
         """A rig as safetensors, framed as its portrait frames it, so that a metre is one of an adult's face.
 
-        `neutral` (V, 3), `faces` (F, 3), `colors` (V, 3) bytes of sRGB; shape k moves the vertices
-        `shape_vertices[shape_starts[k]:shape_starts[k + 1]]` by the same rows of `shape_offsets`. With a texture, which
-        cuts the surface along seams, `corners` are the vertices of what is drawn, `uv` where they lie in the texture,
-        and `triangles` index both.
+        `neutral` (V, 3), `faces` (F, 3), `outward` (F,) 1 where backs cannot be seen, `colors` (V, 3) bytes of sRGB;
+        shape k moves the vertices `shape_vertices[shape_starts[k]:shape_starts[k + 1]]` by the same rows of
+        `shape_offsets`. With a texture, which cuts the surface along seams, `corners` are the vertices of what is
+        drawn, `uv` where they lie in the texture, and `triangles` index both.
         """
         with self._geometry_lock:  # not the other: a page opens while a method is prepared
             if key not in self._geometry:
                 self._geometry[key] = _packed(self.rigs[key])
             return self._geometry[key]
+
+    def progress(self) -> dict[str, Any]:
+        """How far the training of the run is, as `Progress` has it.
+
+        Raises:
+            ReenactError: There is no run.
+        """
+        return asdict(read_progress(self._opened_run()))
+
+    def preview(self, step: int) -> bytes:
+        """The picture of a step of the training, as PNG.
+
+        Raises:
+            ReenactError: There is no run, or no picture of that step.
+        """
+        path = preview_file(self._opened_run(), step)
+        if not path.is_file():
+            raise ReenactError(f"preview: expected a step with a picture, got {step}")
+        return path.read_bytes()
 
     def texture(self, key: str) -> bytes:
         """The rig's texture as PNG.
@@ -230,6 +255,8 @@ class Session:
             raise ReenactError(f"{key}: expected a method that follows the source, got the animation of a file")
         with self._lock, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # which shapes have no partner is to be seen
+            if method in _TRAINED:
+                self._forget_older_networks()
             retarget = self._once((key, method), lambda: self._retargeter(key, method))
         size = _CHUNK if method in _FRAME_BY_FRAME else max(1, len(clip))
         for rows in clip.weights.split(size):
@@ -289,8 +316,7 @@ class Session:
         """What can move a target, the most useful first."""
         target, known = self.rigs[key], []
         if self.run is not None and key == self.targets[0]:
-            known += ["networks"] if (self.run.folder / "checkpoints" / "latest").exists() else []
-            known += ["pairs"] if known and self.run.config.pairs.method != "none" else []
+            known += [each for each in _TRAINED if each != "pairs" or self.run.config.pairs.method != "none"]
         known += ["file"] if key in self.files and _own_clip(self.files[key]) is not None else []
         known += ["truth"] if self._true(target, torch.zeros(1, len(self.clip.names))) is not None else []
         return known + list(METHODS)
@@ -326,6 +352,25 @@ class Session:
         """From the source to a target: that of the run, or found now, which takes seconds."""
         known = None if self.run is None else self.run.correspondence(self.source, key)
         return find_correspondence(self.rigs[self.source], self.rigs[key], _MARKERS) if known is None else known
+
+    def _opened_run(self) -> Run:
+        if self.run is None:
+            raise ReenactError("run: expected the folder of one, got rigs alone; name it to `reenact view`")
+        return self.run
+
+    def _forget_older_networks(self) -> None:
+        """Drop what was made of another checkpoint than the newest one.
+
+        Raises:
+            ReenactError: There is none yet.
+        """
+        newest = newest_step(self.run.folder)
+        if newest is None:
+            due = read_progress(self.run).next_checkpoint
+            raise ReenactError(f"{self.run.folder}: no checkpoint yet; the first is due at step {due:,}")
+        if newest != self._trained_until:
+            self._made = {name: made for name, made in self._made.items() if name[-1] not in _TRAINED}
+            self._trained_until = newest
 
     def _networks(self) -> Any:
         from reenact.inference import ImageRetargeter
@@ -377,6 +422,7 @@ def _packed(rig: Rig) -> bytes:
     arrays = {
         "neutral": (scale * rig.neutral + position).numpy().astype(np.float32),
         "faces": rig.faces.numpy().astype(np.uint32),
+        "outward": outward_faces(rig.neutral.double().numpy(), rig.faces.numpy()).astype(np.uint8),
         "colors": (colors.numpy() * 255).round().clip(0, 255).astype(np.uint8),
         "shape_starts": np.concatenate([[0], moved.sum(1).cumsum()]).astype(np.uint32),
         "shape_vertices": np.nonzero(moved)[1].astype(np.uint32),

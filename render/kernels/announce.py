@@ -23,7 +23,7 @@ class _Counter(event.Listener):
     def on_start(self, event: event.Event) -> None:
         if not self.announced:
             self.announced = True
-            print("render: compiling for this computer, once; later starts take under a second", file=self.stream)
+            print("render: compiling for this computer; later starts find what was compiled", file=self.stream)
 
     def on_end(self, event: event.Event) -> None:
         self.finished += 1
@@ -45,4 +45,5 @@ def announced(stream: TextIOBase | None = None) -> Iterator[None]:
     if counter.announced:
         ending = "\r" if counter.stream.isatty() else ""
         seconds = time.monotonic() - counter.start
-        print(f"{ending}render: compiled {counter.finished} functions in {seconds:.0f} s", file=counter.stream)
+        functions = f"{counter.finished} function{'s' if counter.finished > 1 else ''}"
+        print(f"{ending}render: compiled {functions} in {seconds:.0f} s", file=counter.stream)

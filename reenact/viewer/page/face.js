@@ -8,6 +8,7 @@ export class Face {
   constructor(arrays) {
     this.neutral = arrays.neutral;
     this.faces = arrays.faces;
+    this.outward = arrays.outward; // 1 where only the front can be seen
     this.starts = arrays.shape_starts;
     this.moved = arrays.shape_vertices;
     this.offsets = arrays.shape_offsets;
@@ -55,6 +56,24 @@ export class Face {
       normals[c] += x; normals[c + 1] += y; normals[c + 2] += z;
     }
     return normals;
+  }
+
+  /** Writes the triangles whose fronts look at `eye`, and those whose backs can be seen, to `index`; returns how many numbers. */
+  facing(positions, eye, index) {
+    const { faces, outward, triangles } = this;
+    let count = 0;
+    for (let n = 0; n < faces.length; n += 3) {
+      const a = 3 * faces[n], b = 3 * faces[n + 1], c = 3 * faces[n + 2];
+      const ax = positions[a], ay = positions[a + 1], az = positions[a + 2];
+      const ux = positions[b] - ax, uy = positions[b + 1] - ay, uz = positions[b + 2] - az;
+      const vx = positions[c] - ax, vy = positions[c + 1] - ay, vz = positions[c + 2] - az;
+      const ahead = (uy * vz - uz * vy) * (eye.x - ax) + (uz * vx - ux * vz) * (eye.y - ay) + (ux * vy - uy * vx) * (eye.z - az);
+      if (ahead <= 0 && outward[n / 3]) continue;
+      index[count++] = triangles[n];
+      index[count++] = triangles[n + 1];
+      index[count++] = triangles[n + 2];
+    }
+    return count;
   }
 }
 

@@ -7,9 +7,11 @@ import { Nudges } from "./nudges.js";
 import { Panel, make } from "./panel.js";
 import { DETAIL, loadTexture, Stage } from "./stage.js";
 import { Follower, Track } from "./tracks.js";
+import { Training } from "./training.js";
 
 const MOST_CELLS = 6;
 const MOST_CURVES = 6;
+const OF_RUN = ["networks", "pairs"]; // methods that ask for a checkpoint
 const $ = (id) => document.getElementById(id);
 const TITLES = { networks: "networks (this run)", pairs: "pairs of shapes (this run)", file: "its own animation", truth: "truth by name" };
 const title = (method) => TITLES[method] ?? method;
@@ -90,6 +92,11 @@ for (const suffix of session.exports) {
 }
 $("frames").textContent = `/ ${(frames - 1).toLocaleString("en")}`;
 $("frame").max = $("scrub").max = frames - 1;
+const training = session.run && new Training(session.run, {
+  whole: $("training"), text: $("training-text"), bar: $("training-bar"), losses: $("losses"), names: $("loss-names"),
+  figure: $("preview"), small: $("preview-small"), large: $("preview-large"), enlarge: $("enlarge"), dialog: $("picture"),
+  step: $("preview-step"), at: $("preview-at"),
+}, () => colors, renew);
 $("kept").textContent = session.kept ? `Corrections are kept in ${session.kept}` : "";
 say("");
 
@@ -102,15 +109,39 @@ function trackOf(rig, method, again = false) {
   if (!tracks.has(key) || (again && tracks.get(key).failed)) {
     const track = new Track(rig.index, method, frames, rig.shapes.length);
     tracks.set(key, track);
+    if (OF_RUN.includes(method) && session.run.checkpoint === null) {
+      track.failed = "Rests until the first checkpoint";
+      return track;
+    }
     track.load(() => {
-      if (track.whole && track !== sourceTrack) {
-        const span = nudges.span(rigs[0].index, frames - 1);
-        if (span !== null) follower.follow(track, ...span);
-      }
+      if (track.whole && track !== sourceTrack) followCorrections(track);
       refreshed();
     });
   }
   return tracks.get(key);
+}
+
+/** What the source's corrections change on a target. */
+function followCorrections(track) {
+  const span = nudges.span(rigs[0].index, frames - 1);
+  if (span !== null) follower.follow(track, ...span);
+}
+
+/** Newer networks: what they make of the clip takes the place of what older ones made. Tells whether all of it is there. */
+async function renew(step) {
+  session.run.checkpoint = step;
+  for (const [key, old] of tracks) {
+    if (old.method !== "networks" && !(old.method === "pairs" && old.failed)) continue;
+    const fresh = new Track(old.rig, old.method, frames, old.shapes);
+    await fresh.load(() => {});
+    if (fresh.failed) return false;
+    tracks.set(key, fresh);
+    for (const cell of state.cells) if (cell.track === old) cell.track = fresh;
+    followCorrections(fresh);
+  }
+  refreshed();
+  say(`The networks of step ${step.toLocaleString("en")} move the faces now`);
+  return true;
 }
 
 function addCell(rig, method) {
@@ -317,6 +348,7 @@ function countFrame() {
 dark.addEventListener("change", () => {
   colors = themeColors();
   redrawCurves();
+  training?.draw();
   invalidate();
 });
 
@@ -700,7 +732,7 @@ const KEYS = {
 };
 
 document.addEventListener("keydown", (event) => {
-  if ($("help").open) return;
+  if (document.querySelector("dialog[open]")) return;
   if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z" && !isText(event.target)) {
     event.preventDefault();
     stepBack(() => (event.shiftKey ? nudges.redo() : nudges.undo()));
@@ -710,7 +742,7 @@ document.addEventListener("keydown", (event) => {
   // Arrows move a slider or a choice that has the focus; a space presses a button.
   const own = event.target.closest("input, select");
   if (own && /^(Arrow|Home|End|Page)/.test(event.key)) return;
-  if (event.key === " " && event.target.closest("button, select, input:not([type=range])")) return;
+  if (event.key === " " && event.target.closest("button, select, summary, input:not([type=range])")) return;
   const act = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
   if (!act || (event.target.closest("select") && event.key.length === 1)) return;
   event.preventDefault();
@@ -730,6 +762,7 @@ window.viewer = {
   nudges,
   audio,
   stage,
+  training,
   software: stage.software,
   get idle() {
     return [...tracks.values()].every((track) => track.whole || track.failed) && !follower.busy;

@@ -161,6 +161,7 @@ export class Stage {
       const x = (n % columns) * width, y = (rows - 1 - Math.floor(n / columns)) * height;
       renderer.setViewport(x, y, width, height);
       renderer.setScissor(x, y, width, height);
+      if (this.software) cell.leaveOut(this.detail === DETAIL.playing ? this.camera.position : null);
       renderer.render(cell.scene, this.camera);
     });
   }
@@ -194,7 +195,9 @@ class Cell {
       ? { position: new Float32Array(3 * drawn), normal: new Float32Array(3 * drawn), heat: new Float32Array(drawn) }
       : { position: this.positions, normal: this.normals, heat: this.heat };
     const geometry = new BufferGeometry();
-    geometry.setIndex(new BufferAttribute(face.triangles, 1));
+    this.index = this.whole = new BufferAttribute(face.triangles, 1);
+    this.part = null; // of the triangles, while the clip plays
+    geometry.setIndex(this.index);
     geometry.setAttribute("position", new BufferAttribute(this.drawn.position, 3));
     geometry.setAttribute("normal", new BufferAttribute(this.drawn.normal, 3));
     geometry.setAttribute("heat", new BufferAttribute(this.drawn.heat, 1));
@@ -240,6 +243,22 @@ class Cell {
     geometry.attributes.heat.needsUpdate = Boolean(otherWeights);
     this.material.uniforms.heated.value = Boolean(otherWeights);
     return mean;
+  }
+
+  /** Draws what faces the eye only, half of a head; without an eye everything. A triangle costs even where it is not seen. */
+  leaveOut(eye) {
+    const { face, mesh: { geometry } } = this;
+    if (this.material.wireframe) eye = null; // three.js makes lines of each index anew
+    if (eye === null && this.index === this.whole) return;
+    if (eye !== null) {
+      this.part ??= new BufferAttribute(face.triangles.slice(), 1);
+      geometry.setDrawRange(0, face.facing(this.positions, eye, this.part.array));
+      this.part.needsUpdate = true;
+    } else {
+      geometry.setDrawRange(0, Infinity);
+    }
+    this.index = eye === null ? this.whole : this.part;
+    geometry.setIndex(this.index);
   }
 
   dispose() {
