@@ -76,7 +76,7 @@ class PhysicsConfig:
     """Local and global steps."""
     contact_every: int = 3
     """Steps between two searches for contact."""
-    clean: int = 8
+    clean: int = 30
     """Most rounds that take out what contact is left."""
 
     def __post_init__(self) -> None:
