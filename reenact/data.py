@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -75,11 +77,14 @@ class Studio:
             return motion.expressions(self.rig.names, count, random, self.crowded)
         return self.pool[random.integers(len(self.pool), size=count)]
 
+    def surveyed(self, count: int) -> Float[Tensor, "N K"]:
+        """That many training expressions, always the same ones."""
+        return self.draw(count, np.random.default_rng([self.seed, 3]))
+
     @torch.no_grad()
     def survey(self, count: int) -> Float[Tensor, "N C R R"]:
-        """Pictures of that many training expressions, always the same ones; no gradient."""
-        weights = self.draw(count, np.random.default_rng([self.seed, 3]))
-        return torch.cat([self.photograph(chunk) for chunk in weights.split(_CHUNK)])
+        """Pictures of what is `surveyed`; no gradient."""
+        return torch.cat([self.photograph(chunk) for chunk in self.surveyed(count).split(_CHUNK)])
 
     def photograph(
         self, weights: Float[Tensor, "N K"], buffers: tuple[str, ...] | None = None
@@ -99,6 +104,12 @@ class Studio:
     def glance(self, weights: Float[Tensor, "N K"]) -> Float[Tensor, "N 3 R R"]:
         """What networks are shown of the buffer that they read from, without the cost of the others."""
         return self.show(self.photograph(weights, self.buffers[-1:]))
+
+    @cached_property
+    @torch.no_grad()
+    def looks(self) -> Float[Tensor, "K P"]:
+        """What networks are shown of each shape at 1, as rows."""
+        return self.glance(torch.eye(len(self.rig.names))).flatten(1)
 
     def show(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N C R R"]:
         """What a network sees of pictures: residuals of unit size on average, or the pictures themselves.

@@ -36,17 +36,26 @@ class ImageRetargeter:
         self.networks, self.keys = networks, keys
 
     @classmethod
-    def load(cls, folder: Path | str, reverse: bool = False) -> ImageRetargeter:
-        """The retargeter that a run trained; `reverse` goes from its target to its source.
+    def load(
+        cls, folder: Path | str, reverse: bool = False, source: str | None = None, target: str | None = None
+    ) -> ImageRetargeter:
+        """The retargeter that a run trained.
+
+        Args:
+            folder: The run.
+            reverse: From its target to its source.
+            source: A rig of a cast; see `Run.pair`.
+            target: Another.
 
         Raises:
             FileNotFoundError: There is no run, or nothing was saved yet.
-            ReenactError: The run is damaged, or of another version.
+            ReenactError: The run is damaged, or of another version, or has no such rig.
         """
         run = Run.open(folder)
+        keys = run.pair(source, target)
+        keys = keys[::-1] if reverse else keys
         networks = run.trained_networks()
-        source, target = run.keys[:2][::-1] if reverse else run.keys[:2]
-        return cls(run, run.studio(source), run.studio(target), networks, (source, target))
+        return cls(run, run.studio(keys[0]), run.studio(keys[1]), networks, keys)
 
     @torch.inference_mode()
     def __call__(self, clip: Clip) -> Clip:
