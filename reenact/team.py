@@ -7,6 +7,7 @@ the order in which floats are added. The first process leads: it alone writes.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -41,7 +42,7 @@ class Team:
 
     def share(self, count: int) -> Tensor:
         """Which of so many items are this process's: every `size`-th."""
-        return torch.arange(self.rank, count, self.size)
+        return torch.arange(count)[self.rank :: self.size]
 
     def add(self, *tensors: Tensor) -> None:
         """Replace each tensor, of one type, by its sum over all processes; all of them get the same bits.
@@ -122,7 +123,9 @@ def _told() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        first = str(error).splitlines()[0]
+        first = (
+            re.sub(r"\[[^\]]*\](:\d+)?\s*", "", str(error).splitlines()[0]).partition(". ")[0].strip()
+        )  # without files and addresses
         raise TeamError(
             f"processes: expected all that train together to live, got one that ended ({first[:200]}); the last "
             "checkpoint is intact, go on with --resume, with as many processes as you like"
