@@ -1,4 +1,4 @@
-"""The commands: reenact train | add | infer | evaluate | view | render | convert | inspect | rigs | doctor."""
+"""The commands: reenact train | add | infer | batch | evaluate | view | render | convert | inspect | rigs | doctor."""
 
 from __future__ import annotations
 
@@ -182,6 +182,31 @@ def infer(
     with _busy(f"Writing {out}"):
         save_clip(moved, out, retargeter.target, names[1] if Path(names[1]).is_file() else None)
     print(f"{out}: {len(moved)} frames, {moved.duration:.1f} s, {retargeter.source.name} -> {retargeter.target.name}")
+
+
+def batch(
+    manifest: Annotated[Positional[Path], arg(metavar="MANIFEST")],
+    *,
+    results: Annotated[Path | None, arg(metavar="FILE.csv")] = None,
+) -> int:
+    """Move many clips on many rigs, each as `reenact infer` would; results and failures go to one table.
+
+    An item that fails never stops the rest. A batch that was stopped goes on where it was, and tries again what failed.
+    `torchrun --nproc-per-node N -m reenact.cli batch MANIFEST` shares the items among N processes. The exit status is 3
+    when an item failed.
+
+    Args:
+        manifest: Items as .csv, .json (a list) or .toml ([[item]]): clip and out; run, and from and to for a cast, or
+            method, source and target; correspondence and fps where wanted.
+        results: The table; MANIFEST-results.csv beside the manifest unless said.
+    """
+    results = results or manifest.with_name(f"{manifest.stem}-results.csv")
+    _check_out(results, (".csv",))
+    from reenact.batch import run_batch
+
+    failed, rows = run_batch(manifest, results, lambda text: print(text, flush=True))
+    print(f"{results}: {len(rows) - failed} of {len(rows)} ok, {failed} failed")
+    return 3 if failed else 0
 
 
 def evaluate(
@@ -497,6 +522,7 @@ COMMANDS = {
     "train": train,
     "add": add,
     "infer": infer,
+    "batch": batch,
     "evaluate": evaluate,
     "view": view,
     "render": render,

@@ -86,6 +86,14 @@ class Team:
             torch.distributed.broadcast_object_list(words)
         return words[0]
 
+    def wait(self) -> None:
+        """Until all processes have come here.
+
+        Raises:
+            TeamError: Another process has ended.
+        """
+        self.add(torch.zeros(1))
+
     def follow(self, *tensors: Tensor) -> None:
         """Replace each tensor by the leader's."""
         if self.size > 1:
@@ -95,8 +103,11 @@ class Team:
 
 
 @contextmanager
-def team() -> Iterator[Team]:
+def team(patience: timedelta = _PATIENCE) -> Iterator[Team]:
     """The processes that torchrun started, or this one alone, for the length of a `with` block.
+
+    Args:
+        patience: How long one waits for another that lives.
 
     Raises:
         TeamError: They do not find each other.
@@ -109,7 +120,7 @@ def team() -> Iterator[Team]:
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
     with _told():
         torch.distributed.init_process_group(
-            "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo", timeout=_PATIENCE
+            "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo", timeout=patience
         )
     try:
         yield Team(torch.distributed.get_rank(), torch.distributed.get_world_size())

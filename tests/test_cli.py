@@ -72,8 +72,10 @@ def test_help_names_every_command(capsys):
         ),
         (
             "infer",
-            ["RUN", "CLIP", "--out FILE", "--reverse", "--fps", "--post.gain", "Live Link Face"],
+            ["RUN", "CLIP", "--out FILE", "--from RIG", "--to RIG", "--reverse", "--fps", "--post.gain", "Live Link Face"],
         ),
+        ("add", ["RUN", "RIG", "--run DIR", "--steps"]),
+        ("batch", ["MANIFEST", "--results FILE.csv", "torchrun"]),
         ("evaluate", ["[RUN ...]", "--frames INT", "--seed INT", "--suite", "--methods NAME"]),
         ("view", ["RUN|RIG", "--clip CLIP", "--method NAME", "--audio FILE.wav", "--nudges FILE.json", "--no-browser"]),
         ("render", ["[RUN] CLIP", "--out OUT", "--rig RIG", "--size INT", "--fps", "--opengl", "side by side"]),
