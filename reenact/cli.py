@@ -125,6 +125,7 @@ def infer(
     from_: Annotated[str | None, arg(name="from", metavar="RIG")] = None,
     to: Annotated[str | None, arg(metavar="RIG")] = None,
     reverse: Annotated[bool, FlagCreatePairsOff] = False,
+    device: Literal["cpu", "cuda"] = "cpu",
     fps: float | None = None,
     post: PostConfig = PostConfig(),  # noqa: B008 - frozen
 ) -> None:
@@ -148,6 +149,7 @@ def infer(
         from_: A rig of the run, by its name; the first unless said.
         to: Another; the second unless said.
         reverse: From the target to the source instead.
+        device: Where the run's networks look at pictures; cuda needs an NVIDIA GPU.
         fps: Frames per second of the result; those of the clip unless said.
         post: What to do to the result.
     """
@@ -168,7 +170,7 @@ def infer(
         from reenact.inference import ImageRetargeter
 
         with _busy("Loading the networks"):
-            retargeter: Any = ImageRetargeter.load(inputs[0], reverse, from_, to)
+            retargeter: Any = ImageRetargeter.load(inputs[0], reverse, from_, to, device)
         origins = dict(zip(retargeter.run.keys, retargeter.run.config.rigs))
         names = [origins[key] for key in retargeter.keys]
         moved = _moved_by_networks(retargeter, inputs[-1])

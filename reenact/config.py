@@ -189,6 +189,9 @@ class TrainingConfig:
     """Newest checkpoints that are kept."""
     threads: int | None = None
     """CPU threads; None takes all cores."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where pictures are rendered and networks learn; `cuda` needs an NVIDIA GPU and Warp. Labels are made by the
+    CPU."""
     tensorboard: bool = False
     """Write losses and previews to RUN/tensorboard as well; needs `reenact[tensorboard]`."""
 

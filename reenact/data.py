@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +24,21 @@ _CHUNK = 64
 """Expressions that are photographed at once: bounds memory, not results."""
 
 
+def check_device(device: str) -> None:
+    """Refuse a device that is not there.
+
+    Raises:
+        ReenactError: No NVIDIA GPU that this PyTorch can use, or no Warp, which renders on it.
+    """
+    if device == "cpu":
+        return
+    if not torch.cuda.is_available():
+        built = "no such GPU" if torch.version.cuda else "a PyTorch that was built without CUDA"
+        raise ReenactError(f'device: expected an NVIDIA GPU for "cuda", got {built}; `reenact doctor` says more')
+    if importlib.util.find_spec("warp") is None:
+        raise ReenactError("device: expected Warp to render on the GPU, got none; pip install warp-lang")
+
+
 class Studio:
     """Photographs one rig, in the shared layout, as residuals against its neutral.
 
@@ -37,6 +53,7 @@ class Studio:
         clip: Clip | None = None,
         seed: int = 0,
         crowded: float = 0.0,
+        device: str = "cpu",
     ):
         """
         Args:
@@ -48,6 +65,7 @@ class Studio:
             clip: Training motion with the rig's names; None samples random valid expressions without end.
             seed: Of the survey.
             crowded: Share of random expressions that move any number of shapes; see `motion.expressions`.
+            device: Where pictures are made and stay. Weights come from anywhere, and are drawn on the CPU.
 
         Raises:
             ReenactError: The rig has no eyes above a mouth, or its pictures do not change.
@@ -56,8 +74,9 @@ class Studio:
         self.rig, self.resolution, self.residual = rig, config.resolution, config.residual
         self.buffers = ("color", "motion") if config.motion else ("color",)
         self.rendered_at = config.supersample * config.resolution
-        self.layout = None if layout is None else resize_grid(layout, self.rendered_at)
-        self.portrait = Portrait.of(made_up(rig) if config.makeup else rig)
+        self.layout = None if layout is None else resize_grid(layout, self.rendered_at).to(device)
+        portrait = Portrait.of(made_up(rig) if config.makeup else rig)
+        self.device, self.portrait = device, portrait.to(device)
         self.pool = None if clip is None else clip.weights
         self.neutral = self.photograph(torch.zeros(1, len(rig.names)))[0]  # (C, R, R)
         self.typical = self.draw(_SURVEY, np.random.default_rng([seed, 2]))
@@ -94,10 +113,11 @@ class Studio:
         Differentiable to the weights. Motion is in metres.
         """
         buffers = buffers or self.buffers
-        rendered = self.portrait.render(self.rig.vertices(weights), self.rendered_at, buffers)
+        vertices = self.portrait.rig.vertices(weights.to(self.device))
+        rendered = self.portrait.render(vertices, self.rendered_at, buffers)
         picture = torch.cat([rendered[name] for name in buffers], dim=1)
         if self.layout is not None:  # beyond the picture lies background, which only colours have
-            beyond = torch.cat([_beyond(name, rendered[name].shape[1]) for name in buffers])[:, None, None]
+            beyond = torch.cat([_beyond(name, rendered[name].shape[1]) for name in buffers])[:, None, None].to(picture)
             picture = warp(picture - beyond, self.layout, "zeros") + beyond
         return F.adaptive_avg_pool2d(picture, self.resolution)
 
@@ -169,7 +189,7 @@ def jitter(pictures: Float[Tensor, "N C R R"], elastic: float, random: torch.Gen
         random: Advanced.
     """
     count, resolution = len(pictures), pictures.shape[-1]
-    coarse = elastic * torch.randn(count, 2, 4, 4, generator=random)
+    coarse = elastic * torch.randn(count, 2, 4, 4, generator=random).to(pictures)
     fine = F.interpolate(coarse, size=(resolution, resolution), mode="bicubic", align_corners=True)
-    grid = identity_grid(resolution) + fine.permute(0, 2, 3, 1)
+    grid = identity_grid(resolution).to(pictures) + fine.permute(0, 2, 3, 1)
     return F.grid_sample(pictures, grid, mode="bilinear", padding_mode="border", align_corners=False)

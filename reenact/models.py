@@ -168,9 +168,10 @@ class ComponentReenactNet(nn.Module):
         count = 2 * _COMMON // len(shown)
         level = {key: pictures[:count, -READ:].flatten(1) / energies[key] for key, pictures in shown.items()}
         common = Eigenpictures(2 * self.count, self.bases[next(iter(shown))][0].resolution)
+        common.to(next(self.parameters()).device)
         common.fit(
             torch.cat(list(level.values())).unflatten(1, (READ, common.resolution, common.resolution)),
-            torch.ones(1, common.resolution, common.resolution),
+            common.weight.new_ones(1, common.resolution, common.resolution),
         )
         for key in shown:
             basis = self.bases[key][0]

@@ -167,7 +167,7 @@ def find_teacher(
         )
     if corrected is None or not len(corrected[0]):
         return Teacher(pictures, geometry)
-    strength = source.looks.norm(dim=1) if pictures is None else pictures.strength
+    strength = source.looks.cpu().norm(dim=1) if pictures is None else pictures.strength
     return Teacher(pictures, geometry, Corrections(*corrected, strength))
 
 
@@ -180,7 +180,7 @@ def find_pairs(source: Studio, target: Studio, config: PairsConfig) -> Pairs:
         target: Studio of the rig that it goes to, in the same layout.
         config: When two shapes count as one.
     """
-    ours, theirs = source.looks, target.looks
+    ours, theirs = source.looks.cpu(), target.looks.cpu()
     strength = ours.norm(dim=1)
     correlation = _unit(ours) @ _unit(theirs).T  # (Ks, Kt)
     agreed = _agreed(correlation, config)

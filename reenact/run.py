@@ -207,8 +207,8 @@ class Run:
                 return key
         raise ReenactError(f"{self.folder}: expected a rig of the run, {', '.join(self.keys)}, got {name}")
 
-    def studio(self, key: str) -> Studio:
-        """The studio that photographs one rig for this run's networks.
+    def studio(self, key: str, device: str = "cpu") -> Studio:
+        """The studio that photographs one rig for this run's networks, on a device.
 
         Raises:
             ReenactError: The rig cannot be photographed, or its training clip is damaged.
@@ -224,6 +224,7 @@ class Run:
             clip,
             seed=1000 * config.training.seed + index,
             crowded=config.training.crowded,
+            device=device,
         )
 
     def correspondence(self, source: str, target: str) -> Correspondence | None:

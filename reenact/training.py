@@ -46,7 +46,7 @@ from reenact.checkpoint import (
     save_tensors,
 )
 from reenact.config import Config
-from reenact.data import Studio, jitter
+from reenact.data import Studio, check_device, jitter
 from reenact.errors import ReenactError
 from reenact.folder import migrate
 from reenact.losses import VertexDistance, code_distance, weight_distance
@@ -168,6 +168,7 @@ def train(config: Config, resume: bool = False) -> Path:
     """
     if config.training.tensorboard:
         tensorboard.require()
+    check_device(config.training.device)
     with _interrupts() as interrupts, team() as workers:
         # A folder may look like markup. Only the first process speaks.
         console = Console(file=_Output(), markup=False, highlight=False, emoji=False, quiet=not workers.leads)
@@ -195,12 +196,13 @@ def _train(
     _check_team(config, workers)
     torch.set_num_threads(config.training.threads or torch.get_num_threads())
     partners = {key: run.partners(key) for key in run.keys}
+    device = config.training.device
     with console.status("Photographing neutrals"):
-        studios = {key: run.studio(key) for key in run.keys if partners[key]}
-    networks = run.networks()
+        studios = {key: run.studio(key, device) for key in run.keys if partners[key]}
+    networks = run.networks().to(device)
     with console.status("Comparing shapes"):
         teachers = _find_teachers(run, studios, partners, console, workers)
-    distances = {key: VertexDistance(studio.rig, studio.typical) for key, studio in studios.items()}
+    distances = {key: VertexDistance(studio.rig, studio.typical, device) for key, studio in studios.items()}
     shop = _Workshop(config, studios, networks, run.new_keys, partners, teachers, distances, workers)
     stages = _stages(shop)
     stage_index, first, optimizer = _restore(run, networks, stages) if resume else (0, 0, None)
@@ -474,7 +476,7 @@ def _render(
     for number, other in enumerate(partners):
         if (key, other) in shop.teachers:
             found[other] = _shown_on(shop, (key, other), weights, turn == number, pictured)
-    return _Pool(weights, described, seen, turn, found)
+    return _Pool(weights.to(described), described, seen, turn, found)
 
 
 def _shown_on(shop: _Workshop, pair: tuple[str, str], weights: Tensor, chosen: Tensor, pictured: bool) -> _Partners:
@@ -490,7 +492,7 @@ def _shown_on(shop: _Workshop, pair: tuple[str, str], weights: Tensor, chosen: T
         described = shop.team.map(
             lambda _, chunk: net.describe(other, studio.show(studio.photograph(chunk))), theirs.split(_CHUNK)
         )
-    return _Partners(index, theirs, described, trust)
+    return _Partners(index, theirs.to(studio.device), described, trust)
 
 
 def _corrected_first(shop: _Workshop, key: str, weights: Tensor, seed: list[int]) -> Tensor:
@@ -529,7 +531,7 @@ def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], batch: dict[str, Ten
     is trained already only shows its expressions, on those that learn.
     """
     training, bpnet, networks, losses = shop.config.training, shop.config.bpnet, shop.networks, {}
-    net, codes, zero = networks.reenactnet, {}, torch.zeros(())
+    net, codes, zero = networks.reenactnet, {}, next(iter(pools.values())).described.new_zeros(())
     rendered = done >= bpnet.image_from  # these terms cost more than all the rest
 
     def add(name: str, value: Tensor) -> None:
@@ -547,7 +549,7 @@ def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], batch: dict[str, Ten
             chosen, index, share = pool.shown_on(other, batch[key], mine)
             if not len(chosen):
                 continue
-            share = share * (_count(shop, key, training.batch_size) / training.batch_size)
+            share = share.to(zero) * (_count(shop, key, training.batch_size) / training.batch_size)
             theirs = net.decoders[other](features[chosen])
             distances = net.distances(other, theirs, partners.described[index])
             add(f"pairs.{other}", training.pair_loss * (distances @ share))
@@ -625,10 +627,10 @@ def _reenactnet_losses(shop: _Workshop, pools: dict[str, _Pool], batch: dict[str
         for other, partners in pool.partners.items():
             chosen, index, share = pool.shown_on(other, batch[key], mine)
             name = f"pairs.{other}"
-            losses.setdefault(name, torch.zeros(()))
+            losses.setdefault(name, pool.described.new_zeros(()))
             if len(chosen):
                 distances = net.distances(other, net.decoders[other](features[chosen]), partners.described[index])
-                losses[name] = losses[name] + training.pair_loss * (distances @ share)
+                losses[name] = losses[name] + training.pair_loss * (distances @ share.to(distances))
     return losses
 
 
@@ -651,14 +653,15 @@ def _bpnet_losses(
         place = torch.isin(mine, part).nonzero().flatten()
         if not len(place):
             continue
+        there = place.to(read.device)
         with torch.no_grad():
             if source == key:
                 drawn = net(own.seen[rows[place]], key, key)
             else:
                 partners, chosen = pools[source].partners[key], batch[source][mine[place] - part[0]]
                 drawn = net(pools[source].seen[chosen], source, key)
-                weights = weights.index_copy(0, place, partners.weights[partners.index[chosen]])
-            read = read.index_copy(0, place, net.readable(drawn))
+                weights = weights.index_copy(0, there, partners.weights[partners.index[chosen]])
+            read = read.index_copy(0, there, net.readable(drawn))
     predicted = shop.networks.bpnets[key](read)
     losses = {}
     if bpnet.weight_loss:

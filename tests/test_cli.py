@@ -72,7 +72,17 @@ def test_help_names_every_command(capsys):
         ),
         (
             "infer",
-            ["RUN", "CLIP", "--out FILE", "--from RIG", "--to RIG", "--reverse", "--fps", "--post.gain", "Live Link Face"],
+            [
+                "RUN",
+                "CLIP",
+                "--out FILE",
+                "--from RIG",
+                "--to RIG",
+                "--reverse",
+                "--fps",
+                "--post.gain",
+                "Live Link Face",
+            ],
         ),
         ("add", ["RUN", "RIG", "--run DIR", "--steps"]),
         ("batch", ["MANIFEST", "--results FILE.csv", "torchrun"]),
