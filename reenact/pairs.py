@@ -167,7 +167,7 @@ def find_teacher(
         )
     if corrected is None or not len(corrected[0]):
         return Teacher(pictures, geometry)
-    strength = _looks(source).norm(dim=1) if pictures is None else pictures.strength
+    strength = source.looks.cpu().norm(dim=1) if pictures is None else pictures.strength
     return Teacher(pictures, geometry, Corrections(*corrected, strength))
 
 
@@ -180,7 +180,7 @@ def find_pairs(source: Studio, target: Studio, config: PairsConfig) -> Pairs:
         target: Studio of the rig that it goes to, in the same layout.
         config: When two shapes count as one.
     """
-    ours, theirs = _looks(source), _looks(target)
+    ours, theirs = source.looks.cpu(), target.looks.cpu()
     strength = ours.norm(dim=1)
     correlation = _unit(ours) @ _unit(theirs).T  # (Ks, Kt)
     agreed = _agreed(correlation, config)
@@ -207,11 +207,6 @@ def _agreed(correlation: Tensor, config: PairsConfig) -> tuple[tuple[int, int], 
         if found >= config.similarity and found - torch.maximum(row.max(), column.max()) >= config.margin:
             pairs.append((k, j))
     return tuple(pairs)
-
-
-def _looks(studio: Studio) -> Float[Tensor, "K P"]:
-    """What networks are shown of each shape at 1, as rows."""
-    return studio.glance(torch.eye(len(studio.rig.names))).flatten(1)
 
 
 def _unit(rows: Tensor) -> Tensor:

@@ -87,6 +87,10 @@ class Portrait:
         light = Light(position=torch.tensor([0.15, 0.35, 0.55]))
         return cls(rig, Camera(world_to_camera, CAMERA_DISTANCE / HALF_HEIGHT), light, position, scale)
 
+    def to(self, device: torch.device | str) -> Portrait:
+        """The same portrait with its rig on a device, where it then renders; camera and light may be elsewhere."""
+        return replace(self, rig=self.rig.to(device), position=self.position.to(device))
+
     @property
     def parameters(self) -> Float[Tensor, "19"]:
         """Camera matrix (12), model position (3), model scale (1), light position (3). Source: KI21, section 3."""

@@ -64,7 +64,7 @@ def save_contact_sheet(path: Path, columns: list[Tensor]) -> None:
         torch.nn.functional.interpolate(c.clamp(0, 1), size=(_SHOWN_AT, _SHOWN_AT), mode="bilinear") for c in columns
     ]
     sheet = torch.cat([torch.cat(list(column), dim=1) for column in sized], dim=2)  # (3, rows H, columns W)
-    pixels = (sheet.permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
+    pixels = (sheet.permute(1, 2, 0) * 255).round().to(torch.uint8).cpu().numpy()
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as whole:  # a viewer may be looking
         Image.fromarray(pixels).save(whole, format="PNG")

@@ -2,10 +2,11 @@
 
 config.toml          every setting, resolved
 format.json          which layout the folder has; see `reenact.folder`
-rigs/0-man.npz ...   the rigs as they were; the first is the source, whose layout all others share
+rigs/0-man.npz ...   the rigs as they were; the first is a pair's source, and its layout is shared by all others
 clips/0-man.npz ...  training motion of the rigs that were given some
 layouts.safetensors  sampling grid of each other rig
-correspondences/     pairs of places of the source's surface and each other rig's, where geometry teaches
+correspondences/     pairs of places of the first rig's surface and each other's, where geometry teaches
+base.safetensors     networks of the run that this one adds rigs to
 pairs.json           which shapes of the rigs were found to do the same
 metrics.jsonl        losses by stage and step
 checkpoints/         networks, optimizer, position; see `reenact.checkpoint`
@@ -22,14 +23,14 @@ import re
 import shutil
 import socket
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from reenact.checkpoint import alive, load_checkpoint, load_tensors, save_tensors
-from reenact.config import Config, save_config
+from reenact.config import Config, PairsConfig, save_config
 from reenact.data import Studio
 from reenact.errors import ReenactError
 from reenact.folder import load_run_config, write_format
@@ -51,12 +52,14 @@ _LAYOUT_RESOLUTION = 64
 """Pixels at which layouts are found; a studio enlarges them to the resolution of its pictures."""
 _TAUGHT = "taught.json"
 """Corrections that the networks learn from, in the run folder; nudges.json there is the viewer's."""
+_BASE = "base.safetensors"
+"""Networks of the run that rigs are added to, in the run folder."""
 _FILE = re.compile(r"(\d+)-(.+)\.npz")
 
 
 @dataclass(frozen=True)
 class Run:
-    """An opened run folder. Rigs, layouts and networks are keyed alike; the first key is the source."""
+    """An opened run folder. Rigs, layouts and networks are keyed alike; the first key is the source of a pair."""
 
     folder: Path
     config: Config
@@ -64,14 +67,18 @@ class Run:
     layouts: dict[str, Tensor]
     """(R, R, 2) sampling grid of each rig but the first; empty where the settings ask for none."""
     correspondences: dict[tuple[str, str], Correspondence]
-    """By pair of keys, the earlier first; empty where the settings ask for none."""
+    """By the key of the first rig and that of another; empty where the settings ask for none. Those of a cast are
+    dense: what lies between two others is told by their places on the first."""
+    base: dict[str, Tensor] = field(default_factory=dict)
+    """Networks of the run that this one adds rigs to; empty where it begins anew."""
 
     @classmethod
     def create(cls, config: Config) -> Run:
         """A new run folder with the rigs, their layouts and their training clips in it.
 
         Raises:
-            ReenactError: The folder already holds something, or a rig or clip cannot be read or photographed.
+            ReenactError: The folder already holds something, a rig or clip cannot be read or photographed, or the run
+                to add to has saved nothing yet, or has other settings.
             OSError: The folder cannot be made.
         """
         if config.run:  # before the work, whose result it should hold
@@ -79,13 +86,16 @@ class Run:
             if folder.is_dir():
                 _sweep(folder, folder.resolve().name)
             _check_new(folder)
-        rigs = [
-            load_rig(config.source, Choice(config.source_parts, config.source_shapes)),
-            load_rig(config.target, Choice(config.target_parts, config.target_shapes)),
+        base = None if config.base is None else _base(config)
+        rigs = [] if base is None else list(base.rigs.values())
+        choices = [Choice()] * len(config.cast) or [
+            Choice(config.source_parts, config.source_shapes),
+            Choice(config.target_parts, config.target_shapes),
         ]
+        rigs += [load_rig(name, choice) for name, choice in list(zip(config.rigs, choices))[len(rigs) :]]
         folder = Path(config.run) if config.run else _new_folder(rigs)
         keyed = dict(zip(_keys(rigs), rigs))
-        clip_names = (config.source_clip, config.target_clip)
+        clip_names = [None] * len(config.cast) or [config.source_clip, config.target_clip]
         clips = [None if name is None else load_clip(name, rig) for name, rig in zip(clip_names, rigs)]
         named, config = bool(config.run), replace(config, run=str(folder))
         place = folder.resolve()
@@ -103,12 +113,15 @@ class Run:
                     save_clip(clip, whole / "clips" / f"{index}-{key}.npz")
             if config.pairs.nudges is not None:
                 save_nudges(_usable_nudges(config.pairs.nudges, keyed), whole / _TAUGHT)
-            correspondences = _find_correspondences(keyed, config)
+            correspondences = _find_correspondences(keyed, config, base)
             for (first, second), correspondence in correspondences.items():
                 (whole / "correspondences").mkdir(exist_ok=True)
                 save_correspondence(correspondence, whole / "correspondences" / _pair_file(list(keyed), first, second))
-            layouts = _find_layouts(keyed, correspondences, config)
+            run = cls(folder, config, keyed, {}, correspondences, {} if base is None else base.trained())
+            layouts = _find_layouts(run, base)
             save_tensors(layouts, whole / "layouts.safetensors")
+            if run.base:
+                save_tensors(run.base, whole / _BASE)
             write_format(whole)
             save_config(config, whole / "config.toml")
             # A run appears whole or not at all: by one rename, or with its config, without which it is none, last.
@@ -128,7 +141,7 @@ class Run:
                         _check_new(folder)
                     folder = _new_folder(rigs)
                     place = folder.resolve()
-        return cls(folder, config, keyed, layouts, correspondences)
+        return replace(run, folder=folder, config=config, layouts=layouts)
 
     @classmethod
     def open(cls, folder: Path | str) -> Run:
@@ -143,21 +156,65 @@ class Run:
         config = load_run_config(folder)
         rigs = _load_rigs(folder / "rigs")
         layouts = _load_layouts(folder / "layouts.safetensors", config, list(rigs))
-        return cls(folder, config, rigs, layouts, _load_correspondences(folder / "correspondences", config, rigs))
+        correspondences = _load_correspondences(folder / "correspondences", config, rigs)
+        base = {} if config.base is None else load_tensors(folder / _BASE)
+        return cls(folder, config, rigs, layouts, correspondences, base)
 
     @property
     def keys(self) -> list[str]:
-        """Keys of the rigs, the source first."""
+        """Keys of the rigs, the source of a pair first."""
         return list(self.rigs)
 
-    def studio(self, key: str) -> Studio:
-        """The studio that photographs one rig for this run's networks.
+    @property
+    def new_keys(self) -> list[str]:
+        """Keys of the rigs that the run trains: all, or those that its base lacks."""
+        known = {name.split(".")[1] for name in self.base if name.startswith("bpnets.")}
+        return [key for key in self.rigs if key not in known]
+
+    def partners(self, key: str) -> list[str]:
+        """Keys of the rigs that one is compared with: the first, and those that follow it; see `pairs.partners`.
+
+        A rig of the base is compared with new ones alone, and only with those that are compared with it.
+        """
+        if key not in self.new_keys:
+            return [new for new in self.new_keys if key in self.partners(new)]
+        place = self.keys.index(key)
+        following = self.keys[place + 1 :] + self.keys[:place]
+        return sorted(following, key=lambda other: other != self.keys[0])[: self.config.pairs.partners]
+
+    def pair(self, source: str | None = None, target: str | None = None) -> tuple[str, str]:
+        """Keys of the rigs to move motion between: those that were named, or the run's first two.
+
+        Args:
+            source: A key, a rig's name, or what the settings call it; the first rig unless said, or the second where
+                that is the target.
+            target: Likewise; the second unless said, or the first where that is the source.
+
+        Raises:
+            ReenactError: There is no such rig, or both are the same.
+        """
+        first, second = (name and self._key(name) for name in (source, target))
+        first = first or next(key for key in self.keys if key != second)
+        second = second or next(key for key in self.keys if key != first)
+        if first == second:
+            raise ReenactError(f"{self.folder}: expected two rigs, got {first} twice; it has {', '.join(self.keys)}")
+        return first, second
+
+    def _key(self, name: str) -> str:
+        """The key of a rig by any of its names."""
+        for key, rig, origin in zip(self.rigs, self.rigs.values(), self.config.rigs):
+            if name in (key, rig.name, origin):
+                return key
+        raise ReenactError(f"{self.folder}: expected a rig of the run, {', '.join(self.keys)}, got {name}")
+
+    def studio(self, key: str, device: str = "cpu") -> Studio:
+        """The studio that photographs one rig for this run's networks, on a device.
 
         Raises:
             ReenactError: The rig cannot be photographed, or its training clip is damaged.
         """
         index, config = self.keys.index(key), self.config
-        clip_name = (config.source_clip, config.target_clip)[index] if index < 2 else None
+        clip_name = None if config.cast else (config.source_clip, config.target_clip)[index]
         kept = self.folder / "clips" / f"{index}-{key}.npz"  # the file that was named may have moved since
         clip = None if clip_name is None else load_clip(str(kept) if kept.is_file() else clip_name, self.rigs[key])
         return Studio(
@@ -167,14 +224,23 @@ class Run:
             clip,
             seed=1000 * config.training.seed + index,
             crowded=config.training.crowded,
+            device=device,
         )
 
     def correspondence(self, source: str, target: str) -> Correspondence | None:
         """Pairs of places from one rig to another, by their keys; None where the settings ask for none."""
-        if (source, target) in self.correspondences:
-            return self.correspondences[source, target]
-        back = self.correspondences.get((target, source))
-        return None if back is None else back.reversed()
+        if not self.correspondences:
+            return None
+        first = self.keys[0]
+        if not self.config.cast:
+            known = self.correspondences[tuple(self.keys[:2])]
+            return known if source == first else known.reversed()
+        if first in (source, target):
+            known = self.correspondences[first, target if source == first else source]
+            dense = known if source == first else known.reversed()
+        else:
+            dense = self.correspondences[first, source].reversed().then(self.correspondences[first, target])
+        return dense.sample(self.rigs[source], self.config.pairs.markers)
 
     def teacher(self, source: Studio, target: Studio, source_key: str, target_key: str) -> Teacher:
         """What is known of one rig's expressions on another; the settings must ask for pairs.
@@ -207,6 +273,10 @@ class Run:
         restore_networks(networks, load_checkpoint(self.folder).tensors, self.folder)
         return networks.eval()
 
+    def trained(self) -> dict[str, Tensor]:
+        """The tensors of `trained_networks`."""
+        return dict(self.trained_networks().state_dict())
+
 
 def restore_networks(networks: Networks, tensors: dict[str, Tensor], folder: Path) -> None:
     """Put the networks' part of a checkpoint back into them.
@@ -238,34 +308,62 @@ def networks_state(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)}
 
 
-def _find_layouts(
-    rigs: dict[str, Rig], correspondences: dict[tuple[str, str], Correspondence], config: Config
-) -> dict[str, Tensor]:
+def _base(config: Config) -> Run:
+    """The run that a cast adds rigs to.
+
+    Raises:
+        ReenactError: Its rigs are not the first of the cast, its training has not ended, or its networks are others.
+    """
+    base = Run.open(config.base)
+    known = config.cast[: len(base.rigs)]
+    if len(config.cast) <= len(base.rigs) or any(name != origin for name, origin in zip(known, base.config.rigs)):
+        raise ReenactError(
+            f"{config.base}: expected its rigs and at least one more as cast, got {', '.join(config.cast)}; it has "
+            f"{', '.join(base.config.rigs)}"
+        )
+    own, new = (replace(each, pairs=PairsConfig(method=each.pairs.method)) for each in (base.config, config))
+    for section in ("images", "layout", "pairs", "reenactnet"):
+        if getattr(own, section) != getattr(new, section):
+            raise ReenactError(f"{config.base}: expected its own settings of {section}, got others; take those")
+    if base.config.bpnet.hidden != config.bpnet.hidden or base.config.bpnet.channels != config.bpnet.channels:
+        raise ReenactError(f"{config.base}: expected its own sizes of bpnet, got others; take those")
+    if base.config.source_clip or base.config.target_clip:
+        raise ReenactError(
+            f"{config.base}: expected a run that samples expressions, got training clips; train a cast without them"
+        )
+    return base
+
+
+def _find_layouts(run: Run, base: Run | None) -> dict[str, Tensor]:
     """A layout for each rig but the first; none at all where the settings say so."""
-    if config.layout.method == "none":
+    config, rigs = run.config.layout, run.rigs
+    if config.method == "none":
         return {}
     reference, *others = rigs
-    layouts = {}
-    for key in others:
-        known = correspondences.get((reference, key))
-        if config.layout.method == "found" and known is not None:
+    layouts = {} if base is None else dict(base.layouts)
+    for key in [key for key in others if key not in layouts]:
+        known = run.correspondence(reference, key)
+        if config.method == "found" and known is not None:
             layouts[key] = lay_out(rigs[reference], rigs[key], known, _LAYOUT_RESOLUTION)
         else:
-            layouts[key] = find_layout(
-                rigs[reference], rigs[key], _LAYOUT_RESOLUTION, config.layout, config.training.seed
-            )
+            seed = run.config.training.seed
+            layouts[key] = find_layout(rigs[reference], rigs[key], _LAYOUT_RESOLUTION, config, seed)
     return layouts
 
 
-def _find_correspondences(rigs: dict[str, Rig], config: Config) -> dict[tuple[str, str], Correspondence]:
-    """Between all pairs of rigs, where the settings let geometry teach."""
+def _find_correspondences(
+    rigs: dict[str, Rig], config: Config, base: Run | None = None
+) -> dict[tuple[str, str], Correspondence]:
+    """From the first rig to each other, where the settings let geometry teach; those of a cast are dense."""
     found, given = {}, config.pairs.correspondence
+    count = None if config.cast else config.pairs.markers
     for first, second in _registered(rigs, config):
-        found[first, second] = (
-            find_correspondence(rigs[first], rigs[second], config.pairs.markers)
-            if given is None
-            else load_correspondence(given, rigs[first], rigs[second])
-        )
+        if base is not None and base.config.cast and (first, second) in base.correspondences:
+            found[first, second] = base.correspondences[first, second]
+        elif given is None:
+            found[first, second] = find_correspondence(rigs[first], rigs[second], count)
+        else:
+            found[first, second] = load_correspondence(given, rigs[first], rigs[second])
     return found
 
 
@@ -302,8 +400,9 @@ def _usable_nudges(path: str, rigs: dict[str, Rig]) -> Nudges:
 
 
 def _registered(rigs: dict[str, Rig], config: Config) -> list[tuple[str, str]]:
-    """Keys of the pairs of rigs that have a correspondence."""
-    return list(itertools.combinations(rigs, 2)) if config.pairs.method == "geometry" else []
+    """Keys of the pairs of rigs that have a correspondence: the first, and each other."""
+    first, *others = rigs
+    return [(first, other) for other in others] if config.pairs.method == "geometry" else []
 
 
 def _pair_file(keys: list[str], first: str, second: str) -> str:
@@ -384,7 +483,8 @@ def _check_new(folder: Path, apart_from: str = "") -> None:
 
 
 def _new_folder(rigs: list[Rig]) -> Path:
-    base = "-to-".join(_keys(rigs)[:2])
+    keys = _keys(rigs)
+    base = "-to-".join(keys) if len(keys) == 2 else f"{keys[0]}-and-{len(keys) - 1}"
     number = 1
     while (Path("runs") / f"{base}-{number}").exists():
         number += 1

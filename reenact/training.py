@@ -5,13 +5,16 @@ sections 3.2 and 3.3. The published training goes through stages: ReenactNet fir
 stage in which both learn together: each BPNet reads what ReenactNet draws, and its errors tell ReenactNet what matters
 in a picture. A stage renders some thousand expressions of each rig at a time, describes them once (`reenact.models`),
 and takes its batches from there until it renders others. Every random number comes from (seed, stage, step): a resumed
-run takes the same next step as an unbroken one.
+run takes the same next step as an unbroken one, and so do several processes (`reenact.team`), which share pictures and
+batches, but for the order of sums.
+
+A cast is trained as a pair is. Each expression is shown on one partner only, which costs as much for five rigs as for
+two, a rig.
 """
 
 from __future__ import annotations
 
 import io
-import itertools
 import json
 import math
 import os
@@ -20,7 +23,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -43,7 +46,7 @@ from reenact.checkpoint import (
     save_tensors,
 )
 from reenact.config import Config
-from reenact.data import Studio, jitter
+from reenact.data import Studio, check_device, jitter
 from reenact.errors import ReenactError, interruptions
 from reenact.folder import migrate
 from reenact.losses import VertexDistance, code_distance, weight_distance
@@ -51,6 +54,7 @@ from reenact.models import Networks
 from reenact.pairs import Teacher
 from reenact.preview import save_preview
 from reenact.run import Run, restore_networks
+from reenact.team import Team, TeamError, team
 
 _PICTURES_PER_COMPONENT = 6
 """Pictures of each rig, per principal component, from which networks learn what varies before any training."""
@@ -70,15 +74,17 @@ class _Stage:
 
     name: str
     """`networks`; or `reenactnet`, then `bpnet.KEY`."""
-    network: torch.nn.Module
+    trained: list[Tensor]
+    """What learns."""
     steps: int
     learning_rate: float
     render: Callable[[list[int]], dict[str, _Pool]]
     """Fresh expressions of the rigs that take part; the numbers seed them."""
     draw: Callable[[dict[str, _Pool], torch.Generator], dict[str, Tensor]]
-    """Rows of the pools that make a batch."""
+    """Rows of the pools that make the batch of all processes."""
     losses: Callable[[dict[str, _Pool], dict[str, Tensor], float], dict[str, Tensor]]
-    """Terms whose sum is minimised, on those rows; the share of the steps that are done."""
+    """Terms whose sum is minimised, this process's part of them, on those rows; the share of the steps that are
+    done."""
 
 
 @dataclass(frozen=True)
@@ -88,17 +94,38 @@ class _Pool:
     weights: Tensor  # (N, K)
     described: Tensor  # (N, ...), what decoders should draw
     seen: Tensor  # (N, ...), what the encoder is given: the readable part, jittered
+    turn: Tensor  # (N,), place among the rig's partners of the one that each expression is shown on
     partners: dict[str, _Partners] = field(default_factory=dict)
-    """By key of another rig: how these expressions look there."""
+    """By key of another rig: how the expressions look there whose turn it is."""
+
+    def shown_on(self, other: str, rows: Tensor, mine: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The expressions of a batch that are shown on another rig.
+
+        Args:
+            other: Key of the rig.
+            rows: Of this pool, the whole batch.
+            mine: Places in the batch that are this process's.
+
+        Returns:
+            Places among `mine`, rows of `partners[other]`, and the share of each in a mean over the batch, by
+            confidence among those of one rig.
+        """
+        partners = self.partners[other]
+        index = partners.index[rows]
+        trust = torch.where(index >= 0, partners.confidence[index.clamp_min(0)], 0.0)
+        share = trust / trust.sum().clamp_min(1e-12) * (index >= 0).float().mean()
+        chosen = (index[mine] >= 0).nonzero().flatten()
+        return chosen, index[mine][chosen], share[mine][chosen]
 
 
 @dataclass(frozen=True)
 class _Partners:
-    """What another rig makes of the expressions of a pool."""
+    """What another rig makes of some expressions of a pool, M of them."""
 
-    weights: Tensor  # (N, K)
-    described: Tensor | None  # (N, ...), where they are pictured
-    confidence: Tensor  # (N,)
+    index: Tensor  # (N,), row below of each expression of the pool; -1 where another rig has its turn
+    weights: Tensor  # (M, K)
+    described: Tensor | None  # (M, ...), where they are pictured
+    confidence: Tensor  # (M,)
 
 
 @dataclass(frozen=True)
@@ -108,13 +135,20 @@ class _Workshop:
     config: Config
     studios: dict[str, Studio]
     networks: Networks
+    learning: list[str]
+    """Keys of the rigs that learn: all, or those that are added to a run."""
+    partners: dict[str, list[str]]
+    """By key: the rigs that one is compared with."""
     teachers: dict[tuple[str, str], Teacher]
     """By (source, target); empty where the settings ask for none."""
     vertex_distances: dict[str, VertexDistance]
+    team: Team
 
 
 def train(config: Config, resume: bool = False) -> Path:
-    """Train the networks of a pair of rigs, or go on with a run that stopped.
+    """Train the networks of some rigs, or go on with a run that stopped.
+
+    Under torchrun several processes share the work. Their folder must be on a disk that all of them see.
 
     Args:
         config: All settings; when resuming, only `run` is read, the rest comes from the run's own config.
@@ -126,50 +160,63 @@ def train(config: Config, resume: bool = False) -> Path:
     Raises:
         MissingError: There is no run to resume.
         ReenactError: The folder holds something and `resume` is False, another process trains in it, a rig or clip
-            cannot work, the run is damaged or of another version, a loss or a network is no longer finite.
+            cannot work, the run is damaged or of another version, a loss or a network is no longer finite, another
+            process of the team has ended.
         OSError: The folder cannot be written; the last checkpoint is intact.
         KeyboardInterrupt: Ctrl-C; everything up to the last finished step was saved.
         SystemExit: SIGTERM or a lost terminal, likewise saved; status 143 or 129.
     """
     if config.training.tensorboard:
         tensorboard.require()
-    console = Console(file=_Output(), markup=False, highlight=False, emoji=False)  # a folder may look like markup
-    with _interrupts() as interrupts:
+    check_device(config.training.device)
+    with _interrupts() as interrupts, team() as workers:
+        # A folder may look like markup. Only the first process speaks.
+        console = Console(file=_Output(), markup=False, highlight=False, emoji=False, quiet=not workers.leads)
         # Already for the layout, which sums of several threads would end in other bits from time to time.
         torch.set_num_threads(config.training.threads or torch.get_num_threads())
         with console.status("Reading rigs, finding the layout"):
-            run = Run.open(Path(config.run or "")) if resume else Run.create(config)
-        with RunLock(run.folder) as lock:
-            if resume:
+            if workers.leads:
+                run = Run.open(Path(config.run or "")) if resume else Run.create(config)
+        with RunLock(run.folder) if workers.leads else nullcontext() as lock:
+            if resume and workers.leads:
                 migrate(run.folder, run.config)
+            folder = workers.agree(str(run.folder) if workers.leads else None)
+            run = run if workers.leads else Run.open(Path(folder))
             console.print(f"To watch it, elsewhere: reenact view {_quoted(run)}", soft_wrap=True)
-            _train(run, resume, lock, interrupts, console)
-    _say_next(console, run)
+            _train(run, resume, lock, interrupts, console, workers)
+    if workers.leads:
+        _say_next(console, run)
     return run.folder
 
 
-def _train(run: Run, resume: bool, lock: RunLock, interrupts: _Interrupts, console: Console) -> None:
+def _train(
+    run: Run, resume: bool, lock: RunLock | None, interrupts: _Interrupts, console: Console, workers: Team
+) -> None:
     """The loop, for all stages that are left; interrupts end it at once until its first step, then after a save."""
     config = run.config
+    _check_team(config, workers)
     torch.set_num_threads(config.training.threads or torch.get_num_threads())
+    partners = {key: run.partners(key) for key in run.keys}
+    device = config.training.device
     with console.status("Photographing neutrals"):
-        studios = {key: run.studio(key) for key in run.keys}
-    networks = run.networks()
+        studios = {key: run.studio(key, device) for key in run.keys if partners[key]}
+    networks = run.networks().to(device)
     with console.status("Comparing shapes"):
-        teachers = _find_teachers(run, studios, console)
-    distances = {key: VertexDistance(studio.rig, studio.typical) for key, studio in studios.items()}
-    stages = _stages(_Workshop(config, studios, networks, teachers, distances))
+        teachers = _find_teachers(run, studios, partners, console, workers)
+    distances = {key: VertexDistance(studio.rig, studio.typical, device) for key, studio in studios.items()}
+    shop = _Workshop(config, studios, networks, run.new_keys, partners, teachers, distances, workers)
+    stages = _stages(shop)
     stage_index, first, optimizer = _restore(run, networks, stages) if resume else (0, 0, None)
     if (stage_index, first) == (0, 0):
-        count = _PICTURES_PER_COMPONENT * config.reenactnet.components
         with console.status("Finding what varies in each rig's pictures"):
-            networks.fit({key: studio.show(studio.survey(count)) for key, studio in studios.items()})
+            _begin(run, shop)
     done = sum(stage.steps for stage in stages[:stage_index])
-    board = tensorboard.Board(run.folder, config.training.tensorboard, done + first)
+    board = tensorboard.Board(run.folder, config.training.tensorboard and workers.leads, done + first)
     with _progress(console) as show, interrupts.patiently(), board:
         for index, stage in list(enumerate(stages))[stage_index:]:
             optimizer = optimizer or _optimizer(config, stage)
-            log = _Log(run.folder / "metrics.jsonl", stage.name, first, partial(board.scalars, stage.name, done))
+            path = run.folder / "metrics.jsonl" if workers.leads else None
+            log = _Log(path, stage.name, first, partial(board.scalars, stage.name, done))
             pools, saved = None, first
             networks.train()
             for step in range(first, stage.steps):
@@ -180,8 +227,8 @@ def _train(run: Run, resume: bool, lock: RunLock, interrupts: _Interrupts, conso
                     try:
                         with interrupts.promptly():
                             pools = stage.render([config.training.seed, index, chapter])
-                    except (KeyboardInterrupt, SystemExit):  # no step is half done: what was learnt is kept
-                        if step > saved:
+                    except (KeyboardInterrupt, SystemExit, TeamError):  # no step is half done: what was learnt is kept
+                        if step > saved and workers.leads:
                             log.flush()
                             _save(run, lock, networks, optimizer, index, step, done + step)
                         _say_stopped(console, run)
@@ -193,7 +240,14 @@ def _train(run: Run, resume: bool, lock: RunLock, interrupts: _Interrupts, conso
                 loss = torch.stack(list(losses.values())).sum()
                 optimizer.zero_grad(set_to_none=True)
                 loss.backward()
-                wrong = _not_finite(loss, stage.network)
+                try:
+                    losses, stop = _summed(workers, stage.trained, losses, interrupts.asked is not None)
+                except TeamError:
+                    if step > saved and workers.leads:
+                        log.flush()
+                        _save(run, lock, networks, optimizer, index, step, done + step)
+                    raise
+                wrong = _not_finite(losses, stage.trained)
                 if wrong:
                     kept = _keep_batch(run, pools, rows, losses, done + step)
                     raise ReenactError(
@@ -204,15 +258,16 @@ def _train(run: Run, resume: bool, lock: RunLock, interrupts: _Interrupts, conso
                 log.add(step, losses)
                 show(stage.name, step + 1, stage.steps, log.recent)
                 last = step + 1 == stage.steps
-                if last or (step + 1) % config.training.save_every == 0 or interrupts.asked:
-                    log.flush()
-                    _save(run, lock, networks, optimizer, index, step + 1, done + step + 1)
+                if last or (step + 1) % config.training.save_every == 0 or stop:
                     saved = step + 1
-                    if not interrupts.asked:
-                        _preview(run, networks, studios, index, done + step + 1, console, board)
-                if interrupts.asked:
+                    if workers.leads:
+                        log.flush()
+                        _save(run, lock, networks, optimizer, index, step + 1, done + step + 1)
+                        if not stop:
+                            _preview(run, networks, studios, index, done + step + 1, console, board)
+                if stop:
                     _say_stopped(console, run)
-                    raise interrupts.asked
+                    raise interrupts.asked or SystemExit(128 + signal.SIGTERM)  # another process was asked
             done, first, optimizer = done + stage.steps, 0, None
 
 
@@ -235,15 +290,67 @@ def learning_rate(step: int, steps: int, peak: float, schedule: str) -> float:
     return peak * (1e-4 + (1 - 1e-4) * (1 + math.cos(math.pi * (step - warm) / (steps - warm))) / 2)
 
 
-def _find_teachers(run: Run, studios: dict[str, Studio], console: Console) -> dict[tuple[str, str], Teacher]:
-    """Teachers between all rigs, both ways; what they say of single shapes goes to pairs.json, for people to read."""
+def _check_team(config: Config, workers: Team) -> None:
+    """Refuse what several processes cannot share."""
+    smallest = config.training.batch_size if config.training.together else config.bpnet.batch_size
+    if workers.size > smallest:
+        raise ReenactError(
+            f"processes: expected at most one for each of {smallest} pictures of a batch, got {workers.size}; start "
+            "fewer, or raise the batch_size"
+        )
+    if workers.size > 1 and config.training.align_loss:
+        raise ReenactError(
+            f"processes: expected one, for training.align_loss compares whole batches, got {workers.size}; set it to 0"
+        )
+
+
+@torch.no_grad()
+def _begin(run: Run, shop: _Workshop) -> None:
+    """Take what the networks know before any training, from pictures and from the run that this one adds to."""
+    networks, config = shop.networks, run.config
+
+    def survey(key: str, count: int) -> Tensor:
+        studio = shop.studios[key]
+        chunks = studio.surveyed(count).split(_CHUNK)
+        return shop.team.map(lambda _, chunk: studio.show(studio.photograph(chunk)), chunks)
+
+    count = _PICTURES_PER_COMPONENT * config.reenactnet.components
+    if run.base:
+        networks.load_state_dict(networks.state_dict() | run.base)
+        known = [key for key in shop.studios if key not in shop.learning]
+        shown = {key: survey(key, max(_CHUNK, count // len(known))) for key in known}
+        networks.join(shown | {key: survey(key, count) for key in shop.learning}, shop.learning)
+    else:
+        networks.fit({key: survey(key, count) for key in shop.studios})
+    shop.team.follow(*networks.state_dict().values())
+
+
+def _summed(
+    workers: Team, trained: list[Tensor], losses: dict[str, Tensor], asked: bool
+) -> tuple[dict[str, Tensor], bool]:
+    """Gradients and losses of all processes, and whether any was asked to stop."""
+    if workers.size == 1:
+        return losses, asked
+    values = torch.stack([value.detach() for value in losses.values()])
+    used = values.new_tensor([each.grad is not None for each in trained])
+    stop = values.new_tensor([float(asked)])
+    workers.add(values, used, stop)
+    learnt = [each for each, count in zip(trained, used.tolist()) if count]
+    for each in learnt:
+        each.grad = torch.zeros_like(each) if each.grad is None else each.grad
+    workers.add(*[each.grad for each in learnt])
+    return dict(zip(losses, values)), bool(stop)
+
+
+def _find_teachers(
+    run: Run, studios: dict[str, Studio], partners: dict[str, list[str]], console: Console, workers: Team
+) -> dict[tuple[str, str], Teacher]:
+    """Teachers from each rig to its partners; what they say of single shapes goes to pairs.json, for people to read."""
     if run.config.pairs.method == "none":
         return {}
     teachers, words = {}, {}
     for source in studios:
-        for target in studios:
-            if source == target:
-                continue
+        for target in partners[source]:
             teacher = run.teacher(studios[source], studios[target], source, target)
             teachers[source, target] = teacher
             names = studios[source].rig.names, studios[target].rig.names
@@ -263,37 +370,49 @@ def _find_teachers(run: Run, studios: dict[str, Studio], console: Console) -> di
                 "the rest are mixtures",
                 soft_wrap=True,
             )
-    write_atomically(run.folder / "pairs.json", (json.dumps(words, indent=1, ensure_ascii=False) + "\n").encode())
+    if workers.leads:
+        write_atomically(run.folder / "pairs.json", (json.dumps(words, indent=1, ensure_ascii=False) + "\n").encode())
     return teachers
 
 
 def _stages(shop: _Workshop) -> list[_Stage]:
     training, bpnet, keys = shop.config.training, shop.config.bpnet, list(shop.studios)
+    networks = shop.networks
+    trained = list(networks.parameters())
+    if shop.learning != list(shop.partners):
+        networks.requires_grad_(False)
+        trained = [each.requires_grad_() for key in shop.learning for each in networks.own(key)]
 
     def render_all(seed: list[int]) -> dict[str, _Pool]:
-        return {key: _render(shop, key, seed, keys) for key in keys}
+        return {key: _render(shop, key, seed, shop.partners[key], _count(shop, key, training.frames)) for key in keys}
+
+    def draw_all(pools: dict[str, _Pool], random: torch.Generator) -> dict[str, Tensor]:
+        return {
+            key: torch.randint(len(pool.weights), (_count(shop, key, training.batch_size),), generator=random)
+            for key, pool in pools.items()
+        }
 
     steps = planned_steps(shop.config, keys)
     if training.together:
         return [
             _Stage(
                 "networks",
-                shop.networks,
+                trained,
                 steps["networks"],
                 training.learning_rate,
                 render_all,
-                lambda pools, random: _draw(pools, training.batch_size, random),
+                draw_all,
                 lambda pools, rows, done: _joint_losses(shop, pools, rows, done),
             )
         ]
     stages = [
         _Stage(
             "reenactnet",
-            shop.networks.reenactnet,
+            list(networks.reenactnet.parameters()),
             steps["reenactnet"],
             training.learning_rate,
             render_all,
-            lambda pools, random: _draw(pools, training.batch_size, random),
+            draw_all,
             lambda pools, rows, _done: _reenactnet_losses(shop, pools, rows),
         )
     ]
@@ -302,12 +421,15 @@ def _stages(shop: _Workshop) -> list[_Stage]:
         stages.append(
             _Stage(
                 f"bpnet.{key}",
-                shop.networks.bpnets[key],
+                list(networks.bpnets[key].parameters()),
                 steps[f"bpnet.{key}"],
                 bpnet.learning_rate,
                 lambda seed, key=key, others=others: {
-                    key: _render(shop, key, seed, []),
-                    **{other: _render(shop, other, seed, [key], pictured=False) for other in others},
+                    key: _render(shop, key, seed, [], training.frames),
+                    **{
+                        other: _render(shop, other, seed, [key], -(-training.frames // len(others)), pictured=False)
+                        for other in others
+                    },
                 },
                 lambda pools, random, key=key: _draw_for_bpnet(shop, key, pools, random),
                 lambda pools, rows, done, key=key: _bpnet_losses(shop, key, pools, rows, done),
@@ -316,32 +438,62 @@ def _stages(shop: _Workshop) -> list[_Stage]:
     return stages
 
 
+def _count(shop: _Workshop, key: str, count: int) -> int:
+    """How many of so many expressions are a rig's: all, or a part where rigs that are trained already share them."""
+    if key in shop.learning:
+        return count
+    return -(-count // (len(shop.studios) - len(shop.learning)))
+
+
 @torch.no_grad()
-def _render(shop: _Workshop, key: str, seed: list[int], partners: list[str], pictured: bool = True) -> _Pool:
-    """Fresh expressions of a rig, and how they look on its partners; `pictured` draws them there too."""
+def _render(
+    shop: _Workshop, key: str, seed: list[int], partners: list[str], count: int, pictured: bool = True
+) -> _Pool:
+    """Fresh expressions of a rig, and how each looks on one of its partners; `pictured` draws it there too."""
     place = list(shop.studios).index(key)
-    count, elastic = shop.config.training.frames, shop.config.training.elastic
+    elastic = shop.config.training.elastic
     weights = shop.studios[key].draw(count, np.random.default_rng([*seed, place]))
     weights = _corrected_first(shop, key, weights, seed)
-    net, random = shop.networks.reenactnet, _torch_random([*seed, place])
-    parts, bent = [], []
-    for chunk in weights.split(_CHUNK):
+    chunks, net = weights.split(_CHUNK), shop.networks.reenactnet
+
+    def describe(_number: int, chunk: Tensor) -> Tensor:
+        return net.describe(key, shop.studios[key].show(shop.studios[key].photograph(chunk)))
+
+    def look(number: int, chunk: Tensor) -> Tensor:
+        """Both what `describe` says and what the encoder is given instead, side by side."""
         shown = shop.studios[key].show(shop.studios[key].photograph(chunk))
-        parts.append(net.describe(key, shown))
-        if elastic:
-            bent.append(net.readable(net.describe(key, jitter(shown, elastic, random))))
-    described = torch.cat(parts)
-    seen = torch.cat(bent) if elastic else net.readable(described)
+        bent = jitter(shown, elastic, _torch_random([*seed, place, 2, number]))
+        return torch.cat([net.describe(key, shown), net.readable(net.describe(key, bent))], dim=1)
+
+    if elastic:
+        both = shop.team.map(look, chunks)
+        bent = net.readable(both).shape[1]
+        described, seen = both[:, :-bent], both[:, -bent:]
+    else:
+        described = shop.team.map(describe, chunks)
+        seen = net.readable(described)
+    turn = torch.randperm(count, generator=_torch_random([*seed, place, 3])) % max(1, len(partners))
     found = {}
-    for other in partners:
+    for number, other in enumerate(partners):
         if (key, other) in shop.teachers:
-            teacher, pictures = shop.teachers[key, other], []
-            theirs = teacher.weights(weights)
-            for chunk in theirs.split(_CHUNK) if pictured else ():
-                pictures.append(net.describe(other, shop.studios[other].show(shop.studios[other].photograph(chunk))))
-            trust = teacher.confidence(weights, theirs).clamp_min(_LEAST_TRUST)
-            found[other] = _Partners(theirs, torch.cat(pictures) if pictured else None, trust)
-    return _Pool(weights, described, seen, found)
+            found[other] = _shown_on(shop, (key, other), weights, turn == number, pictured)
+    return _Pool(weights.to(described), described, seen, turn, found)
+
+
+def _shown_on(shop: _Workshop, pair: tuple[str, str], weights: Tensor, chosen: Tensor, pictured: bool) -> _Partners:
+    """How those of the expressions look on another rig that are chosen."""
+    teacher, other = shop.teachers[pair], pair[1]
+    studio, net = shop.studios[other], shop.networks.reenactnet
+    index = torch.where(chosen, chosen.cumsum(0) - 1, -1)
+    weights = weights[chosen]
+    theirs = teacher.weights(weights)
+    trust = teacher.confidence(weights, theirs).clamp_min(_LEAST_TRUST)
+    described = None
+    if pictured:
+        described = shop.team.map(
+            lambda _, chunk: net.describe(other, studio.show(studio.photograph(chunk))), theirs.split(_CHUNK)
+        )
+    return _Partners(index, theirs.to(studio.device), described, trust)
 
 
 def _corrected_first(shop: _Workshop, key: str, weights: Tensor, seed: list[int]) -> Tensor:
@@ -359,11 +511,6 @@ def _corrected_first(shop: _Workshop, key: str, weights: Tensor, seed: list[int]
     return torch.cat([torch.lerp(weights[: len(centres)], centres, share), weights[len(centres) :]])
 
 
-def _draw(pools: dict[str, _Pool], count: int, random: torch.Generator) -> dict[str, Tensor]:
-    """As many rows of each pool."""
-    return {key: torch.randint(len(pool.weights), (count,), generator=random) for key, pool in pools.items()}
-
-
 def _draw_for_bpnet(shop: _Workshop, key: str, pools: dict[str, _Pool], random: torch.Generator) -> dict[str, Tensor]:
     """Rows of the rig's own pool; and of the others', whose pictures take the place of the first, by confidence."""
     bpnet = shop.config.bpnet
@@ -378,45 +525,58 @@ def _draw_for_bpnet(shop: _Workshop, key: str, pools: dict[str, _Pool], random: 
 
 
 def _joint_losses(shop: _Workshop, pools: dict[str, _Pool], batch: dict[str, Tensor], done: float) -> dict[str, Tensor]:
-    """Each rig redraws itself and is read back, and the other where a teacher tells how. Ours, after KI21.
+    """Each rig redraws itself and is read back, and the others where a teacher tells how. Ours, after KI21.
 
-    L_recon and L_b of KI21, with one more term: the weights that BPNet reads from what ReenactNet draws of the other
-    rig's pictures, whose error reaches both. Without a teacher BPNet reads what is drawn of the rig itself.
+    L_recon and L_b of KI21, with one more term: the weights that BPNet reads from what ReenactNet draws of another
+    rig's pictures, whose error reaches both. Without a teacher BPNet reads what is drawn of the rig itself. A rig that
+    is trained already only shows its expressions, on those that learn.
     """
     training, bpnet, networks, losses = shop.config.training, shop.config.bpnet, shop.networks, {}
-    net, codes = networks.reenactnet, []
+    net, codes, zero = networks.reenactnet, {}, next(iter(pools.values())).described.new_zeros(())
+    rendered = done >= bpnet.image_from  # these terms cost more than all the rest
 
     def add(name: str, value: Tensor) -> None:
         losses[name] = losses.get(name, 0) + value
 
     for key, pool in pools.items():
-        rows = batch[key]
+        mine = shop.team.share(len(batch[key]))
+        rows, size = batch[key][mine], len(batch[key])
         code, described = net.code(pool.seen[rows], key), pool.described[rows]
         features = net.unfold(code)
-        codes.append(code)
-        drawn = net.decoders[key](features)
-        add(f"reconstruction.{key}", net.distances(key, drawn, described).mean())
-        predicted = networks.bpnets[key](net.readable(described))
-        add(f"weights.{key}", _weight_losses(shop, key, predicted, pool.weights[rows]).mean())
+        codes[key] = code
         for other, partners in pool.partners.items():
-            theirs, trust = net.decoders[other](features), partners.confidence[rows]
-            trust = trust / trust.sum()
-            distances = net.distances(other, theirs, partners.described[rows])
-            add(f"pairs.{other}", training.pair_loss * (distances @ trust))
-            errors = _weight_losses(shop, other, networks.bpnets[other](net.readable(theirs)), partners.weights[rows])
-            add(f"read.{other}", training.read_loss * (errors @ trust))
+            add(f"pairs.{other}", zero)
+            add(f"read.{other}", zero)
+            chosen, index, share = pool.shown_on(other, batch[key], mine)
+            if not len(chosen):
+                continue
+            share = share.to(zero) * (_count(shop, key, training.batch_size) / training.batch_size)
+            theirs = net.decoders[other](features[chosen])
+            distances = net.distances(other, theirs, partners.described[index])
+            add(f"pairs.{other}", training.pair_loss * (distances @ share))
+            read = networks.bpnets[other](net.readable(theirs))
+            errors = _weight_losses(shop, other, read, partners.weights[index])
+            add(f"read.{other}", training.read_loss * (errors @ share))
+        if key not in shop.learning:
+            continue
+        drawn = net.decoders[key](features)
+        add(f"reconstruction.{key}", net.distances(key, drawn, described).sum() / size)
+        predicted = networks.bpnets[key](net.readable(described))
+        add(f"weights.{key}", _weight_losses(shop, key, predicted, pool.weights[rows]).sum() / size)
         if not pool.partners and training.read_loss:
             read = networks.bpnets[key](net.readable(drawn))
-            add(f"read.{key}", training.read_loss * _weight_losses(shop, key, read, pool.weights[rows]).mean())
-        rendered = done >= bpnet.image_from  # these terms cost more than all the rest
-        some = slice(max(1, round(bpnet.image_fraction * training.batch_size)))
+            add(f"read.{key}", training.read_loss * _weight_losses(shop, key, read, pool.weights[rows]).sum() / size)
+        few = max(1, round(bpnet.image_fraction * size))
+        some = (mine < few).nonzero().flatten()
         if bpnet.image_loss and rendered:
-            add(f"image.{key}", bpnet.image_loss * _image_loss(shop, key, predicted[some], described[some]))
+            errors = _image_loss(shop, key, predicted[some], described[some])
+            add(f"image.{key}", bpnet.image_loss * errors.sum() / few)
         if training.cycle_loss and rendered:
-            add(f"cycle.{key}", training.cycle_loss * _cycle_loss(shop, key, features[some], described[some]))
+            misses = _cycle_loss(shop, key, features[some], described[some], pool.turn[rows[some]])
+            add(f"cycle.{key}", training.cycle_loss * misses.sum() / few)
     if training.align_loss:
-        pairs = list(itertools.combinations(codes, 2))
-        add("align", training.align_loss * torch.stack([code_distance(*pair) for pair in pairs]).mean())
+        first, *others = codes.values()
+        add("align", training.align_loss * torch.stack([code_distance(first, other) for other in others]).mean())
     return losses
 
 
@@ -427,41 +587,51 @@ def _weight_losses(shop: _Workshop, key: str, predicted: Tensor, weights: Tensor
 
 
 def _image_loss(shop: _Workshop, key: str, predicted: Tensor, described: Tensor) -> Tensor:
-    """L_r of KI21: how far the render of predicted weights is from the picture that they were read from."""
+    """(N,), L_r of KI21: how far the render of predicted weights is from the picture that they were read from."""
+    if not len(predicted):  # this process has none of those pictures
+        return predicted.sum(1)
     again = shop.studios[key].show(shop.studios[key].photograph(predicted))
     net = shop.networks.reenactnet
-    return net.distances(key, net.describe(key, again), described).mean()
+    return net.distances(key, net.describe(key, again), described)
 
 
-def _cycle_loss(shop: _Workshop, key: str, features: Tensor, described: Tensor) -> Tensor:
-    """How far what comes back by way of each other rig is from the pictures: drawn, read, rendered, drawn back. Ours.
+def _cycle_loss(shop: _Workshop, key: str, features: Tensor, described: Tensor, turn: Tensor) -> Tensor:
+    """How far what comes back of pictures by way of another rig is from them: drawn, read, rendered, drawn back. Ours.
 
-    The render between both halves lets only faces pass that the other rig can make.
+    The render between both halves lets only faces pass that the other rig can make. Each picture goes by way of the
+    partner whose turn it is.
     """
     networks, net, misses = shop.networks, shop.networks.reenactnet, []
-    for other in [each for each in shop.studios if each != key]:
-        weights = networks.bpnets[other](net.readable(net.decoders[other](features)))
+    for number, other in enumerate(shop.partners[key]):
+        chosen = turn == number
+        if not bool(chosen.any()):
+            continue
+        weights = networks.bpnets[other](net.readable(net.decoders[other](features[chosen])))
         rendered = shop.studios[other].show(shop.studios[other].photograph(weights))
         back = net(net.readable(net.describe(other, rendered)), other, key)
-        misses.append(net.distances(key, back, described).mean())
-    return torch.stack(misses).mean()
+        misses.append(net.distances(key, back, described[chosen]))
+    return torch.cat(misses) if misses else features.flatten(1).sum(1)
 
 
 def _reenactnet_losses(shop: _Workshop, pools: dict[str, _Pool], batch: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Each rig redraws itself through the shared encoder, and the other where pairs tell how. Source: KI21, L_recon.
+    """Each rig redraws itself through the shared encoder, and another where pairs tell how. Source: KI21, L_recon.
 
     Ours: residuals against the neutral, jitter of the encoder's input only, pairs.
     """
     training, net, losses = shop.config.training, shop.networks.reenactnet, {}
     for key, pool in pools.items():
-        rows = batch[key]
+        mine = shop.team.share(len(batch[key]))
+        rows, size = batch[key][mine], len(batch[key])
         features = net.encode(pool.seen[rows], key)
         drawn = net.decoders[key](features)
-        losses[f"reconstruction.{key}"] = net.distances(key, drawn, pool.described[rows]).mean()
+        losses[f"reconstruction.{key}"] = net.distances(key, drawn, pool.described[rows]).sum() / size
         for other, partners in pool.partners.items():
-            distances = net.distances(other, net.decoders[other](features), partners.described[rows])
-            trust = partners.confidence[rows]
-            losses[f"pairs.{other}"] = training.pair_loss * (distances @ trust) / trust.sum()
+            chosen, index, share = pool.shown_on(other, batch[key], mine)
+            name = f"pairs.{other}"
+            losses.setdefault(name, pool.described.new_zeros(()))
+            if len(chosen):
+                distances = net.distances(other, net.decoders[other](features[chosen]), partners.described[index])
+                losses[name] = losses[name] + training.pair_loss * (distances @ share.to(distances))
     return losses
 
 
@@ -470,36 +640,41 @@ def _bpnet_losses(
 ) -> dict[str, Tensor]:
     """Weights are read back from pictures of the rig's own expressions. Source: KI21, L_b = L_w + L_r.
 
-    Ours: part of the pictures is drawn by ReenactNet, from the other rig's where there are pairs; errors also count by
-    how far they move the vertices; L_r is taken on part of the pictures.
+    Ours: part of the pictures is drawn by ReenactNet, from other rigs' where there are pairs; errors also count by how
+    far they move the vertices; L_r is taken on part of the pictures.
     """
-    bpnet, net, own = shop.config.bpnet, shop.networks.reenactnet, pools[key]
-    rows = batch[key]
+    bpnet, net, own, size = shop.config.bpnet, shop.networks.reenactnet, pools[key], len(batch[key])
+    mine = shop.team.share(size)
+    rows = batch[key][mine]
     weights, described = own.weights[rows], own.described[rows]
     read = net.readable(described)
     count = round(bpnet.decoded_fraction * bpnet.batch_size)
     sources = [other for other in pools if key in pools[other].partners] or [key]
     for source, part in zip(sources, torch.arange(count).tensor_split(len(sources))):
-        if not len(part):
+        place = torch.isin(mine, part).nonzero().flatten()
+        if not len(place):
             continue
+        there = place.to(read.device)
         with torch.no_grad():
             if source == key:
-                drawn = net(own.seen[rows[part]], key, key)
+                drawn = net(own.seen[rows[place]], key, key)
             else:
-                partners, chosen = pools[source].partners[key], batch[source]
+                partners, chosen = pools[source].partners[key], batch[source][mine[place] - part[0]]
                 drawn = net(pools[source].seen[chosen], source, key)
-                weights = weights.index_copy(0, part, partners.weights[chosen])
-            read = read.index_copy(0, part, net.readable(drawn))
+                weights = weights.index_copy(0, there, partners.weights[partners.index[chosen]])
+            read = read.index_copy(0, there, net.readable(drawn))
     predicted = shop.networks.bpnets[key](read)
     losses = {}
     if bpnet.weight_loss:
-        losses["weights"] = bpnet.weight_loss * weight_distance(predicted, weights).mean()
+        losses["weights"] = bpnet.weight_loss * weight_distance(predicted, weights).sum() / size
     if bpnet.vertex_loss:
-        losses["vertices"] = bpnet.vertex_loss * shop.vertex_distances[key](predicted, weights).mean()
+        losses["vertices"] = bpnet.vertex_loss * shop.vertex_distances[key](predicted, weights).sum() / size
     others = 0 if sources == [key] else count  # the first pictures are then of expressions that were not rendered
     rendered = min(max(1, round(bpnet.image_fraction * bpnet.batch_size)), bpnet.batch_size - others)
     if bpnet.image_loss and done >= bpnet.image_from and rendered:
-        losses["image"] = bpnet.image_loss * _image_loss(shop, key, predicted[-rendered:], described[-rendered:])
+        last = (mine >= size - rendered).nonzero().flatten()
+        errors = _image_loss(shop, key, predicted[last], described[last])
+        losses["image"] = bpnet.image_loss * errors.sum() / rendered
     return losses
 
 
@@ -522,9 +697,9 @@ def _step_count(steps: int, epochs: float | None, frames: int, batch_size: int) 
 
 def _optimizer(config: Config, stage: _Stage) -> torch.optim.Optimizer:
     if config.training.optimizer == "adam":
-        return torch.optim.Adam(stage.network.parameters(), lr=stage.learning_rate, fused=True)
+        return torch.optim.Adam(stage.trained, lr=stage.learning_rate, fused=True)
     return torch.optim.AdamW(  # fused: a quarter of each step's time otherwise
-        stage.network.parameters(), lr=stage.learning_rate, weight_decay=config.training.weight_decay, fused=True
+        stage.trained, lr=stage.learning_rate, weight_decay=config.training.weight_decay, fused=True
     )
 
 
@@ -532,11 +707,11 @@ def _torch_random(seed: list[int]) -> torch.Generator:
     return torch.Generator().manual_seed(int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] >> 1))
 
 
-def _not_finite(loss: Tensor, network: torch.nn.Module) -> str:
+def _not_finite(losses: dict[str, Tensor], trained: list[Tensor]) -> str:
     """What is not finite before a step: "the loss", "the gradient", or nothing."""
-    if not torch.isfinite(loss):
+    if not torch.isfinite(torch.stack(list(losses.values())).sum()):
         return "the loss"
-    gradients = [parameter.grad for parameter in network.parameters() if parameter.grad is not None]
+    gradients = [each.grad for each in trained if each.grad is not None]
     return "" if torch.isfinite(torch.nn.utils.get_total_norm(gradients)) else "the gradient"
 
 
@@ -618,14 +793,14 @@ class _Log:
     """Means of the losses, appended to a JSONL file; lines of steps that will be taken again are dropped first."""
 
     def __init__(
-        self, path: Path, stage: str, step: int, tell: Callable[[int, dict[str, float]], None] = lambda *_: None
+        self, path: Path | None, stage: str, step: int, tell: Callable[[int, dict[str, float]], None] = lambda *_: None
     ):
-        """`tell` hears of each line as well."""
+        """`tell` hears of each line as well; without a path nothing is written."""
         self.path, self.stage, self.tell = path, stage, tell
         self.pending: dict[str, list[float]] = {}
         self.recent: dict[str, float] = {}
         self.started, self.step, self.last = time.perf_counter(), step, step
-        if path.exists():
+        if path is not None and path.exists():
             lines = [line for text in path.read_text(errors="replace").splitlines() if (line := parsed_line(text))]
             kept = [line for line in lines if line["stage"] != stage or line["step"] <= step]
             write_atomically(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
@@ -646,8 +821,9 @@ class _Log:
         numbers = {"loss": sum(self.recent.values()), **self.recent, "steps_per_second": speed}
         line = {"stage": self.stage, "step": self.step, **numbers}
         self.tell(self.step, numbers)
-        with self.path.open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        if self.path is not None:
+            with self.path.open("a") as file:
+                file.write(json.dumps(line) + "\n")
         self.pending, self.started, self.last = {}, now, self.step
 
 

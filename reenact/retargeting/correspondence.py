@@ -119,6 +119,26 @@ class Correspondence:
         """The same pairs from the target to the source."""
         return Correspondence(self.target, self.source, self.confidence)
 
+    def then(self, other: Correspondence) -> Correspondence:
+        """From this source by way of a third rig to the other's target: pairs that meet there at one vertex. Ours.
+
+        Both must lie on whole vertices of the third rig, this one with its targets, as `reversed` makes of what
+        `find_correspondence` finds from it. A pair is right where both are: their confidences multiply.
+
+        Raises:
+            ReenactError: They meet at fewer than four vertices.
+        """
+        middles = []
+        for places in (self.target, other.source):
+            whole = places.shares.amax(1) == 1
+            middles.append(torch.where(whole, places.corners.gather(1, places.shares.argmax(1, True))[:, 0], -1))
+        rows = {vertex: row for row, vertex in enumerate(middles[1].tolist()) if vertex >= 0}
+        met = [(row, rows[vertex]) for row, vertex in enumerate(middles[0].tolist()) if vertex in rows]
+        if len(met) < 4:
+            raise ReenactError(f"correspondence: expected at least 4 pairs that meet on a third rig, got {len(met)}")
+        here, there = torch.tensor(met).T
+        return Correspondence(self.source[here], other.target[there], self.confidence[here] * other.confidence[there])
+
     @classmethod
     def identity(cls, source: Rig, target: Rig) -> Correspondence:
         """Each vertex with the vertex of the same number, for rigs that share their topology.

@@ -116,6 +116,8 @@ class Session:
         audio: Path | None = None,
         nudges: Path | None = None,
         fps: float | None = None,
+        source: str | None = None,
+        target: str | None = None,
     ) -> Session:
         """The session of a run folder, or of rigs by name or file.
 
@@ -126,6 +128,8 @@ class Session:
             audio: As in the constructor.
             nudges: Where corrections are kept: RUN/nudges.json, or nowhere, unless said.
             fps: Frames per second to play at; the clip's unless said.
+            source: Of a run of a cast, by any of its names; the first rig unless said.
+            target: Another; the second unless said.
 
         Raises:
             ReenactError: Nothing to show, or something of it cannot be read.
@@ -139,8 +143,9 @@ class Session:
         run, files = None, {}
         if folders:
             run = Run.open(folders[0])
-            rigs = {key: run.rigs[key] for key in run.keys[:2]}
-            origins = dict(zip(rigs, (run.config.source, run.config.target)))
+            rigs = {key: run.rigs[key] for key in run.pair(source, target)}
+            named = dict(zip(run.keys, run.config.rigs))
+            origins = {key: named[key] for key in rigs}
             nudges = nudges or run.folder / "nudges.json"
         else:
             rigs, origins = {}, {}
@@ -149,10 +154,10 @@ class Session:
                 key = rig.name if rig.name not in rigs else f"{rig.name} ({len(rigs) + 1})"
                 rigs[key], origins[key] = rig, name
         files = {key: Path(name) for key, name in origins.items() if Path(name).is_file()}
-        source = next(iter(rigs))
+        first = next(iter(rigs))
         if clip is None:
-            clip = str(files[source]) if source in files and _own_clip(files[source]) is not None else DEFAULT_CLIP
-        played = load_clip(clip, rigs[source])
+            clip = str(files[first]) if first in files and _own_clip(files[first]) is not None else DEFAULT_CLIP
+        played = load_clip(clip, rigs[first])
         played = played if fps is None else resampled(played, fps)
         return cls(rigs, played, clip, files, run, method, audio, nudges)
 
@@ -375,7 +380,8 @@ class Session:
     def _networks(self) -> Any:
         from reenact.inference import ImageRetargeter
 
-        return self._once(("networks",), lambda: ImageRetargeter.load(self.run.folder))
+        source, target = self.rigs
+        return self._once(("networks",), lambda: ImageRetargeter.load(self.run.folder, source=source, target=target))
 
     def _once(self, name: tuple[str, ...], make: Callable[[], Any]) -> Any:
         """What was made under this name before, or now."""
