@@ -81,7 +81,7 @@ class Team:
         """The leader's text, in all processes."""
         if self.size == 1:
             return text or ""
-        letters = torch.frombuffer(bytearray((text or "").encode()), dtype=torch.uint8)  # nothing is pickled
+        letters = torch.tensor(list((text or "").encode()), dtype=torch.uint8)  # nothing is pickled
         length = torch.tensor([len(letters)])
         self.follow(length)
         letters = letters if self.leads else torch.empty(int(length), dtype=torch.uint8)
