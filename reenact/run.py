@@ -231,16 +231,15 @@ class Run:
         """Pairs of places from one rig to another, by their keys; None where the settings ask for none."""
         if not self.correspondences:
             return None
-        first = self.keys[0]
+        known, back = (self.correspondences.get(pair) for pair in ((source, target), (target, source)))
+        if known is None and back is not None:
+            known = back.reversed()
         if not self.config.cast:
-            known = self.correspondences[tuple(self.keys[:2])]
-            return known if source == first else known.reversed()
-        if first in (source, target):
-            known = self.correspondences[first, target if source == first else source]
-            dense = known if source == first else known.reversed()
-        else:
-            dense = self.correspondences[first, source].reversed().then(self.correspondences[first, target])
-        return dense.sample(self.rigs[source], self.config.pairs.markers)
+            return known
+        if known is None:
+            first = self.keys[0]
+            known = self.correspondences[first, source].reversed().then(self.correspondences[first, target])
+        return known.sample(self.rigs[source], self.config.pairs.markers)
 
     def teacher(self, source: Studio, target: Studio, source_key: str, target_key: str) -> Teacher:
         """What is known of one rig's expressions on another; the settings must ask for pairs.
