@@ -180,6 +180,8 @@ def train(config: Config, resume: bool = False) -> Path:
         with RunLock(run.folder) if workers.leads else nullcontext() as lock:
             if resume and workers.leads:
                 migrate(run.folder, run.config)
+                for leftover in (run.folder / "previews").glob(".*.tmp"):  # of a process that was killed
+                    leftover.unlink(missing_ok=True)
             folder = workers.agree(str(run.folder) if workers.leads else None)
             run = run if workers.leads else Run.open(Path(folder))
             console.print(f"To watch it, elsewhere: reenact view {_quoted(run)}", soft_wrap=True)
