@@ -50,8 +50,8 @@ def train(
 
     A rig is a built-in name (`reenact rigs` lists them) or a file: .glb, .gltf, .vrm, .fbx, USD, .npz, or a folder of
     .obj files; `reenact inspect` shows what is in it. A clip is a file, or synthetic:SEED[:SECONDS]. Settings come from
-    their defaults, then from --config, then from the options below. `torchrun --nproc-per-node N train.py ...` shares
-    the work among N processes; docs/scale.md tells of machines and clusters.
+    their defaults, then from --config, then from the options below. `torchrun --nproc-per-node N -- train.py ...`
+    shares the work among N processes; docs/scale.md tells of machines and clusters.
 
     Args:
         settings: Every setting.
@@ -194,8 +194,8 @@ def batch(
     """Move many clips on many rigs, each as `reenact infer` would; results and failures go to one table.
 
     An item that fails never stops the rest. A batch that was stopped goes on where it was, and tries again what failed.
-    `torchrun --nproc-per-node N -m reenact.cli batch MANIFEST` shares the items among N processes. The exit status is 3
-    when an item failed.
+    `torchrun --nproc-per-node N -m -- reenact.cli batch MANIFEST` shares the items among N processes. The exit status is
+    3 when an item failed.
 
     Args:
         manifest: Items as .csv, .json (a list) or .toml ([[item]]): clip and out; run, and from and to for a cast, or

@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 import time
@@ -13,6 +15,7 @@ import safetensors.torch
 import team_worker
 import torch
 from conftest import make_toy_rig
+from torch.distributed.run import get_args_parser
 
 from reenact import training
 from reenact.checkpoint import load_checkpoint
@@ -136,3 +139,15 @@ def test_a_failure_of_pytorch_becomes_a_sentence():
 
     with pytest.raises(TeamError, match=r"got one that ended \(Connection closed by peer\); the last"), _told():
         raise RuntimeError("[gloo/pair.cc:553] Connection closed by peer [127.0.0.1]:9093. This is\nand a page")
+
+
+def test_torchrun_understands_the_commands_of_the_page():
+    """Without `--` it takes `--run` for an option of its own, cut short."""
+    page = (Path(__file__).parents[1] / "docs" / "scale.md").read_text().replace("\\\n", " ")
+    commands = re.findall(r"^(?:srun )?torchrun (.*?)(?: *#.*)?$", page, re.MULTILINE)
+    assert len(commands) == 4
+    for command in commands:
+        understood = get_args_parser().parse_args(shlex.split(command.replace("$SLURM_NNODES", "4")))
+        script = [understood.training_script, *understood.training_script_args]
+        assert next(word for word in script if word != "--") in ("train.py", "reenact.cli")
+        assert ("--run" in script) != ("batch" in script)
