@@ -194,8 +194,8 @@ def batch(
     """Move many clips on many rigs, each as `reenact infer` would; results and failures go to one table.
 
     An item that fails never stops the rest. A batch that was stopped goes on where it was, and tries again what failed.
-    `torchrun --nproc-per-node N -m -- reenact.cli batch MANIFEST` shares the items among N processes. The exit status is
-    3 when an item failed.
+    `torchrun --nproc-per-node N -m -- reenact.cli batch MANIFEST` shares the items among N processes. The exit status
+    is 3 when an item failed.
 
     Args:
         manifest: Items as .csv, .json (a list) or .toml ([[item]]): clip and out; run, and from and to for a cast, or
