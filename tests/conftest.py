@@ -1,4 +1,6 @@
-"""Rigs and runs that several test files share."""
+"""Rigs, runs and a browser that several test files share."""
+
+import shutil
 
 import numpy as np
 import pytest
@@ -110,3 +112,18 @@ def toy_run(toy_config, tmp_path_factory):
     tensors = {f"networks.{name}": tensor for name, tensor in networks.state_dict().items()}
     save_checkpoint(run.folder, 1, tensors, {})
     return run
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """A browser without a window, whose 3D is drawn by software."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright, of the extra dev")
+    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if path is None:
+        pytest.skip("needs chromium or google-chrome")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=path, args=["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+        )
+        yield browser
+        browser.close()

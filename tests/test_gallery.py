@@ -1,7 +1,6 @@
 """The page of everything that moves, in a browser. What it shows is drawn by parts that have tests of their own."""
 
 import importlib.util
-import shutil
 import sys
 from pathlib import Path
 
@@ -42,8 +41,8 @@ def test_a_clip_that_goes_round_is_at_rest_at_both_ends_and_itself_between(galle
     assert float(made.diff(dim=0).abs().max()) < 0.12  # pi / 2 / 15 frames
 
 
-def test_faces_play_in_step_and_stop_when_asked(page, browser):
-    shown = browser.new_page()
+def test_faces_play_in_step_and_stop_when_asked(page, chromium):
+    shown = chromium.new_page()
     shown.goto(page.as_uri())
     shown.wait_for_function("document.getElementById('play').textContent === 'Pause'")
     both = "() => [...document.querySelectorAll('canvas')].map((each) => each.toDataURL())"
@@ -63,8 +62,8 @@ def test_faces_play_in_step_and_stop_when_asked(page, browser):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_nothing_moves_where_motion_is_to_be_reduced_and_all_is_named_and_readable(page, browser, scheme):
-    shown = browser.new_page(reduced_motion="reduce", color_scheme=scheme)
+def test_nothing_moves_where_motion_is_to_be_reduced_and_all_is_named_and_readable(page, chromium, scheme):
+    shown = chromium.new_page(reduced_motion="reduce", color_scheme=scheme)
     asked = []
     shown.on("request", lambda request: asked.append(request.url))
     shown.goto(page.as_uri())
@@ -73,15 +72,3 @@ def test_nothing_moves_where_motion_is_to_be_reduced_and_all_is_named_and_readab
     assert tab_stops(shown) == [("play", True)]
     assert [url for url in asked if not url.startswith(("file:", "data:"))] == []
     shown.close()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    sync_api = pytest.importorskip("playwright.sync_api")
-    path = shutil.which("chromium") or shutil.which("google-chrome")
-    if path is None:
-        pytest.skip("needs chromium or google-chrome")
-    with sync_api.sync_playwright() as playwright:
-        made = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield made
-        made.close()

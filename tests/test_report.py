@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from html.parser import HTMLParser
 
 import numpy as np
@@ -248,18 +247,6 @@ def test_the_sentence_on_several_runs_says_whether_the_order_is_sure():
     assert "overlap" in report.compared([entry("one", 0.4, 0.3, 0.5), entry("two", 0.35, 0.3, 0.41)])
     unknown = entry("three", None, None, None)
     assert report.compared([unknown, entry("one", 0.4, 0.3, 0.5)]) == ""
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright, of the extra dev")
-    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if path is None:
-        pytest.skip("needs chromium or google-chrome")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import http.client
 import json
 import math
 import random
-import shutil
 import signal
 import socket
 import subprocess
@@ -606,20 +605,6 @@ def test_ctrl_c_ends_the_command_cleanly(tmp_path, toy_pair):
 
 # ---------------------------------------------------------------------------------------------------------------------
 # The page, in a real browser
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright, of the extra dev")
-    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if path is None:
-        pytest.skip("needs chromium or google-chrome")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=path, args=["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
-        )
-        yield browser
-        browser.close()
 
 
 class Opened:
