@@ -42,6 +42,12 @@ def replacing(path: Path | str) -> Iterator[Path]:
     _sync_folder(path.parent)
 
 
+def sweep(folder: Path) -> None:
+    """Remove what killed processes left half written in a folder to which no other process writes now."""
+    for leftover in folder.glob(".*.tmp"):
+        leftover.unlink(missing_ok=True)
+
+
 def _sync_folder(folder: Path) -> None:
     if os.name == "nt":  # Windows cannot open a folder; NTFS journals the rename
         return

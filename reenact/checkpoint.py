@@ -34,7 +34,7 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
-from reenact.atomic import write_atomically
+from reenact.atomic import sweep, write_atomically
 from reenact.errors import MissingError, ReenactError
 
 FORMAT = 1
@@ -72,8 +72,7 @@ def save_checkpoint(
     """
     folder = run_dir / "checkpoints"
     folder.mkdir(parents=True, exist_ok=True)
-    for leftover in folder.glob(".*.tmp"):  # of a process that was killed while it wrote
-        leftover.unlink(missing_ok=True)
+    sweep(folder)
     copies = _copies(tensors)
     text = json.dumps({"format": FORMAT, "step": step, "state": state})
     header = {"reenact": text, "sha256": _digest(copies, text)}

@@ -36,7 +36,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
 
 from reenact import tensorboard
-from reenact.atomic import write_atomically
+from reenact.atomic import sweep, write_atomically
 from reenact.checkpoint import (
     RunLock,
     flatten_optimizer,
@@ -180,8 +180,7 @@ def train(config: Config, resume: bool = False) -> Path:
         with RunLock(run.folder) if workers.leads else nullcontext() as lock:
             if resume and workers.leads:
                 migrate(run.folder, run.config)
-                for leftover in (run.folder / "previews").glob(".*.tmp"):  # of a process that was killed
-                    leftover.unlink(missing_ok=True)
+                sweep(run.folder / "previews")
             folder = workers.agree(str(run.folder) if workers.leads else None)
             run = run if workers.leads else Run.open(Path(folder))
             console.print(f"To watch it, elsewhere: reenact view {_quoted(run)}", soft_wrap=True)
@@ -214,6 +213,13 @@ def _train(
             _begin(run, shop)
     done = sum(stage.steps for stage in stages[:stage_index])
     board = tensorboard.Board(run.folder, config.training.tensorboard and workers.leads, done + first)
+
+    def keep(log: _Log, optimizer: torch.optim.Optimizer, index: int, step: int) -> None:
+        """Save so many steps of a stage, if this process is the one that writes."""
+        if workers.leads:
+            log.flush()
+            _save(run, lock, networks, optimizer, index, step, done + step)
+
     with _progress(console) as show, interrupts.patiently(), board:
         for index, stage in list(enumerate(stages))[stage_index:]:
             optimizer = optimizer or _optimizer(config, stage)
@@ -230,9 +236,8 @@ def _train(
                         with interrupts.promptly():
                             pools = stage.render([config.training.seed, index, chapter])
                     except (KeyboardInterrupt, SystemExit, TeamError):  # no step is half done: what was learnt is kept
-                        if step > saved and workers.leads:
-                            log.flush()
-                            _save(run, lock, networks, optimizer, index, step, done + step)
+                        if step > saved:
+                            keep(log, optimizer, index, step)
                         _say_stopped(console, run)
                         raise
                 for group in optimizer.param_groups:
@@ -245,9 +250,8 @@ def _train(
                 try:
                     losses, stop = _summed(workers, stage.trained, losses, interrupts.asked is not None)
                 except TeamError:
-                    if step > saved and workers.leads:
-                        log.flush()
-                        _save(run, lock, networks, optimizer, index, step, done + step)
+                    if step > saved:
+                        keep(log, optimizer, index, step)
                     raise
                 wrong = _not_finite(losses, stage.trained)
                 if wrong:
@@ -262,11 +266,9 @@ def _train(
                 last = step + 1 == stage.steps
                 if last or (step + 1) % config.training.save_every == 0 or stop:
                     saved = step + 1
-                    if workers.leads:
-                        log.flush()
-                        _save(run, lock, networks, optimizer, index, step + 1, done + step + 1)
-                        if not stop:
-                            _preview(run, networks, studios, index, done + step + 1, console, board)
+                    keep(log, optimizer, index, step + 1)
+                    if workers.leads and not stop:
+                        _preview(run, networks, studios, index, done + step + 1, console, board)
                 if stop:
                     _say_stopped(console, run)
                     raise interrupts.asked or SystemExit(128 + signal.SIGTERM)  # another process was asked

@@ -20,7 +20,7 @@ def tet_volumes(points: Float[ndarray, "X 3"], tets: Int[ndarray, "M 4"]) -> Flo
 
 
 def volume_gradient(points: Float[ndarray, "X 3"], tets: Int[ndarray, "M 4"], count: int) -> Float[ndarray, "X 3"]:
-    """How the sum of all volumes grows as each of `count` points moves."""
+    """How the sum of all volumes grows as each of `count` points moves, in square units of the points."""
     a, b, c, d = points[tets].swapaxes(0, 1)
     slopes = np.stack([np.cross(c - d, b - d), np.cross(a - d, c - d), np.cross(b - d, a - d)], 1) / 6
     slopes = np.concatenate([slopes, -slopes.sum(1, keepdims=True)], 1)
