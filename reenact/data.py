@@ -20,8 +20,8 @@ from reenact.rigs.rig import Rig
 
 _SURVEY = 256
 """Random expressions from which a studio learns how the rig typically moves."""
-_CHUNK = 64
-"""Expressions that are photographed at once: bounds memory, not results."""
+_PIXELS = 16 * 128 * 128
+"""Pixels that are rendered at once where no gradient is wanted: bounds memory, not results."""
 
 
 def check_device(device: str) -> None:
@@ -103,7 +103,7 @@ class Studio:
     @torch.no_grad()
     def survey(self, count: int) -> Float[Tensor, "N C R R"]:
         """Pictures of what is `surveyed`; no gradient."""
-        return torch.cat([self.photograph(chunk) for chunk in self.surveyed(count).split(_CHUNK)])
+        return self.photograph(self.surveyed(count))
 
     def photograph(
         self, weights: Float[Tensor, "N K"], buffers: tuple[str, ...] | None = None
@@ -113,6 +113,13 @@ class Studio:
         Differentiable to the weights. Motion is in metres.
         """
         buffers = buffers or self.buffers
+        if weights.requires_grad and torch.is_grad_enabled():
+            return self._photograph(weights, buffers)
+        chunks = weights.split(max(1, _PIXELS // self.rendered_at**2))
+        return torch.cat([self._photograph(chunk, buffers) for chunk in chunks])
+
+    def _photograph(self, weights: Float[Tensor, "N K"], buffers: tuple[str, ...]) -> Float[Tensor, "N C R R"]:
+        """All at once."""
         vertices = self.portrait.rig.vertices(weights.to(self.device))
         rendered = self.portrait.render(vertices, self.rendered_at, buffers)
         picture = torch.cat([rendered[name] for name in buffers], dim=1)

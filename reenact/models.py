@@ -25,6 +25,7 @@ pass behind them. There are no skip connections past the code: they would carry 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import torch
@@ -39,6 +40,8 @@ READ = 3
 """Channels that are read from, the last ones of a picture: its motion pass, or its colours if it has no other."""
 _SPREAD = 4.0
 """Standard deviation of the strongest component in a description; activations of that size train well."""
+_COLUMNS = 8192
+"""Numbers of each picture that are in double precision at a time."""
 _COMMON = 1200
 """Pictures of each of two rigs from which the components that the encoder sees are taken; more rigs share as many."""
 
@@ -90,14 +93,18 @@ class Eigenpictures(nn.Module):
         flat = shown.flatten(1) * self.weight
         self.mean.copy_(flat.mean(0))
         flat -= self.mean
-        double = flat.double()  # energies span six orders of magnitude, float32 sums would drown the last components
-        values, vectors = torch.linalg.eigh(double @ double.T)  # of the small side, ascending
+        parts = flat.split(_COLUMNS, dim=1)
+        # Energies span six orders of magnitude, float32 sums would drown the last components.
+        gram = sum(part @ part.T for part in map(Tensor.double, parts))
+        values, vectors = torch.linalg.eigh(gram)  # of the small side, ascending
         count = min(len(self.components), len(flat) - 1)
         values, vectors = values.flip(0).clamp_min(0), vectors.flip(1)
         kept = values[:count] > 1e-9 * values[0]
-        rows = (vectors[:, :count].T @ double) * kept[:, None]  # U^T X: components times singular values
+        turned = vectors[:, :count].T * kept[:, None]
         self.components.zero_()
-        self.components[:count] = F.normalize(rows, dim=1).float()
+        for rows, part in zip(self.components[:count].split(_COLUMNS, dim=1), parts):
+            rows.copy_(turned @ part.double())  # U^T X: components times singular values
+        self.components[:count] = F.normalize(self.components[:count], dim=1)
         deviations = (values[:count] * kept / len(flat)).sqrt().float()
         self.unit.copy_(deviations[0] / _SPREAD)
         even = torch.where(kept, deviations.clamp_min(1e-12).rsqrt(), 0.0)  # 1 / sqrt: energies become deviations
@@ -159,21 +166,20 @@ class ComponentReenactNet(nn.Module):
         return torch.stack([basis.distances(*block) for basis, *block in parts]).mean(0)
 
     @torch.no_grad()
-    def fit(self, shown: dict[str, Float[Tensor, "N C R R"]]) -> None:
-        """Take the components from pictures of each rig."""
-        for key, pictures in shown.items():
+    def fit(self, keys: list[str], survey: Callable[[str], Float[Tensor, "N C R R"]]) -> None:
+        """Take the components from pictures of each rig, one rig at a time: all at once would fill a memory."""
+        energies, level = {}, []
+        for key in keys:
+            pictures = survey(key)
             for basis, block in zip(self.bases[key], (pictures[:, -READ:], pictures[:, :READ])):
                 basis.fit(block, motion_weight(block))
-        energies = {key: energy(pictures[:, -READ:]).flatten() for key, pictures in shown.items()}
-        count = 2 * _COMMON // len(shown)
-        level = {key: pictures[:count, -READ:].flatten(1) / energies[key] for key, pictures in shown.items()}
-        common = Eigenpictures(2 * self.count, self.bases[next(iter(shown))][0].resolution)
-        common.to(next(self.parameters()).device)
-        common.fit(
-            torch.cat(list(level.values())).unflatten(1, (READ, common.resolution, common.resolution)),
-            common.weight.new_ones(1, common.resolution, common.resolution),
-        )
-        for key in shown:
+            read = pictures[:, -READ:]
+            energies[key] = energy(read).flatten()
+            level.append(read[: 2 * _COMMON // len(keys)] / energies[key].unflatten(0, read.shape[1:]))
+            del pictures, read, block  # before the next rig's come
+        common = Eigenpictures(2 * self.count, level[0].shape[-1]).to(level[0].device)
+        common.fit(torch.cat(level), common.weight.new_ones(1, common.resolution, common.resolution))
+        for key in keys:
             basis = self.bases[key][0]
             place = basis.weight * energies[key]
             self.to_common[key].weight.copy_(
@@ -284,15 +290,19 @@ class ConvolutionalReenactNet(nn.Module):
         return (difference * self.scales[key].emphasis).mean((1, 2, 3))
 
     @torch.no_grad()
-    def fit(self, shown: dict[str, Float[Tensor, "N C R R"]], leveled: bool, weighted: bool) -> None:
+    def fit(
+        self, keys: list[str], survey: Callable[[str], Float[Tensor, "N C R R"]], leveled: bool, weighted: bool
+    ) -> None:
         """Measure where each rig's pictures vary.
 
         Args:
-            shown: Pictures of each rig.
+            keys: Of the rigs.
+            survey: Gives pictures of a rig, asked once for each.
             leveled: The encoder sees each place and channel divided by how much it varies.
             weighted: Distances count pixels by how much they move.
         """
-        for key, pictures in shown.items():
+        for key in keys:
+            pictures = survey(key)
             if leveled:
                 self.scales[key].energy.copy_(energy(pictures[:, -READ:]))
             if weighted:
@@ -359,12 +369,17 @@ class Networks(nn.Module):
         self.bpnets = nn.ModuleDict(read)
         self.config = config
 
-    def fit(self, shown: dict[str, Float[Tensor, "N C R R"]]) -> None:
-        """Take from pictures of each rig what the networks know of them before any training."""
+    def fit(self, keys: list[str], survey: Callable[[str], Float[Tensor, "N C R R"]]) -> None:
+        """Take from pictures what the networks know of each rig before any training.
+
+        Args:
+            keys: Of the rigs.
+            survey: Gives pictures of a rig, asked once for each.
+        """
         if isinstance(self.reenactnet, ComponentReenactNet):
-            self.reenactnet.fit(shown)
+            self.reenactnet.fit(keys, survey)
         else:
-            self.reenactnet.fit(shown, self.config.images.residual, self.config.training.motion_weighting)
+            self.reenactnet.fit(keys, survey, self.config.images.residual, self.config.training.motion_weighting)
 
     def join(self, shown: dict[str, Float[Tensor, "N C R R"]], new: list[str]) -> None:
         """As `fit`, of new rigs beside others that are trained already; nothing of the others changes.
@@ -376,7 +391,7 @@ class Networks(nn.Module):
         if isinstance(self.reenactnet, ComponentReenactNet):
             self.reenactnet.join(shown, new)
         else:
-            self.fit({key: shown[key] for key in new})
+            self.fit(new, shown.__getitem__)
 
     def own(self, key: str) -> list[Tensor]:
         """What belongs to one rig alone and can be learnt: its part of ReenactNet, and its BPNet."""

@@ -65,14 +65,16 @@ class Team:
             function: Gets the number of a chunk and its rows; makes as many rows.
             chunks: At least one.
         """
+        whole, parts = None, ()
+        for place in self.share(len(chunks)).tolist():
+            made = function(place, chunks[place])
+            if whole is None:
+                whole, parts = _room(made, chunks)
+            parts[place].copy_(made)
         if self.size == 1:
-            return torch.cat([function(place, chunk) for place, chunk in enumerate(chunks)])
-        made = {place: function(place, chunks[place]) for place in self.share(len(chunks)).tolist()}
-        like = next(iter(made.values())) if made else function(0, chunks[0][:1])
-        whole = like.new_zeros(sum(map(len, chunks)), *like.shape[1:])
-        parts = whole.split([len(chunk) for chunk in chunks])
-        for place, part in made.items():
-            parts[place].copy_(part)
+            return whole
+        if whole is None:
+            whole, _ = _room(function(0, chunks[0][:1]), chunks)
         with _told():
             torch.distributed.all_reduce(whole)  # to the zeros of the others: no bit changes
         return whole
@@ -102,6 +104,13 @@ class Team:
             with _told():
                 for tensor in tensors:
                     torch.distributed.broadcast(tensor, 0)
+
+
+def _room(made: Tensor, chunks: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Zeros for what is made of all chunks, whole and chunk by chunk; all at once, for a list of parts and their
+    sum would take twice the memory."""
+    whole = made.new_zeros(sum(map(len, chunks)), *made.shape[1:])
+    return whole, whole.split([len(chunk) for chunk in chunks])
 
 
 @contextmanager

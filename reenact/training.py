@@ -325,7 +325,7 @@ def _begin(run: Run, shop: _Workshop) -> None:
         shown = {key: survey(key, max(_CHUNK, count // len(known))) for key in known}
         networks.join(shown | {key: survey(key, count) for key in shop.learning}, shop.learning)
     else:
-        networks.fit({key: survey(key, count) for key in shop.studios})
+        networks.fit(list(shop.studios), lambda key: survey(key, count))
     shop.team.follow(*networks.state_dict().values())
 
 

@@ -108,7 +108,7 @@ def toy_run(toy_config, tmp_path_factory):
     run = Run.create(replace(toy_config, run=str(tmp_path_factory.mktemp("runs") / "toy")))
     networks = run.networks()
     studios = {key: run.studio(key) for key in run.keys}
-    networks.fit({key: studio.show(studio.survey(20)) for key, studio in studios.items()})
+    networks.fit(list(studios), lambda key: studios[key].show(studios[key].survey(20)))
     tensors = {f"networks.{name}": tensor for name, tensor in networks.state_dict().items()}
     save_checkpoint(run.folder, 1, tensors, {})
     return run

@@ -115,7 +115,7 @@ def test_both_rigs_are_seen_through_the_same_components():
     """The map to the common components gives what they make of the pictures themselves."""
     net = ComponentReenactNet(["a", "b"], 16, ReenactNetConfig(components=8, width=8, code=4), colored=False)
     shown = {"a": _low_rank(5, seed=1), "b": _low_rank(5, seed=2)}
-    net.fit(shown)
+    net.fit(list(shown), shown.__getitem__)
     level = torch.cat([pictures / energy(pictures) for pictures in shown.values()]).flatten(1)
     common = torch.cat([net.to_common[key](net.describe(key, pictures)) for key, pictures in shown.items()])
     # Components are a rotation: distances between pictures are kept, up to the unit.
@@ -127,7 +127,8 @@ def test_both_rigs_are_seen_through_the_same_components():
 def test_colours_are_drawn_beside_what_is_read():
     config = Config(images=ImageConfig(resolution=16), reenactnet=ReenactNetConfig(components=8, color_components=4))
     networks = Networks({"a": 3, "b": 5}, config)
-    networks.fit({"a": torch.cat([_low_rank(5), _low_rank(3)], 1), "b": torch.cat([_low_rank(4), _low_rank(6)], 1)})
+    shown = {"a": torch.cat([_low_rank(5), _low_rank(3)], 1), "b": torch.cat([_low_rank(4), _low_rank(6)], 1)}
+    networks.fit(list(shown), shown.__getitem__)
     shown = torch.cat([_low_rank(5), _low_rank(3)], 1)[:2]
     assert networks.redraw(shown, "a", "b").shape == (2, 6, 16, 16)
     assert networks.read(shown, "b").shape == (2, 5)
