@@ -71,6 +71,9 @@ class PairsConfig:
     """Rigs of a cast that each rig is compared with, at most: the first, and those that follow it in the cast. All
     rigs share a code, so that any two understand each other all the same, and the costs grow with the rigs and not with
     their pairs."""
+    shown: int = 4
+    """Partners that each expression of a rig is shown on, at most; all of them have their turns. With one, rigs of a
+    cast learn too little of each other to be as good as pairs."""
     nudges: str | None = None
     """A file of corrections made in the viewer, such as another run's nudges.json: the networks are taught expressions
     near a corrected frame as it was left."""
@@ -406,6 +409,7 @@ _ALLOWED: dict[str, _Rule] = {
     "layout.samples": _ONE_OR_MORE,
     "pairs.markers": ("a whole number from 50 to 5,000", lambda value: 50 <= value <= 5000),
     "pairs.partners": _ONE_OR_MORE,
+    "pairs.shown": _ONE_OR_MORE,
     "pairs.similarity": _FRACTION,
     "pairs.margin": _FRACTION,
     "reenactnet.code": _ONE_OR_MORE,

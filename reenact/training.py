@@ -8,8 +8,8 @@ and takes its batches from there until it renders others. Every random number co
 run takes the same next step as an unbroken one, and so do several processes (`reenact.team`), which share pictures and
 batches, but for the order of sums.
 
-A cast is trained as a pair is. Each expression is shown on one partner only, which costs as much for five rigs as for
-two, a rig.
+A cast is trained as a pair is. Each expression is shown on a few partners only (`pairs.shown`), so that from some rigs
+on the next costs as much as the last.
 """
 
 from __future__ import annotations
@@ -94,9 +94,9 @@ class _Pool:
     weights: Tensor  # (N, K)
     described: Tensor  # (N, ...), what decoders should draw
     seen: Tensor  # (N, ...), what the encoder is given: the readable part, jittered
-    turn: Tensor  # (N,), place among the rig's partners of the one that each expression is shown on
+    turn: Tensor  # (N,), place among the rig's partners of the first that each expression is shown on
     partners: dict[str, _Partners] = field(default_factory=dict)
-    """By key of another rig: how the expressions look there whose turn it is."""
+    """By key of another rig: how the expressions look there that are shown there."""
 
     def shown_on(self, other: str, rows: Tensor, mine: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The expressions of a batch that are shown on another rig.
@@ -122,7 +122,7 @@ class _Pool:
 class _Partners:
     """What another rig makes of some expressions of a pool, M of them."""
 
-    index: Tensor  # (N,), row below of each expression of the pool; -1 where another rig has its turn
+    index: Tensor  # (N,), row below of each expression of the pool; -1 where it is shown on others
     weights: Tensor  # (M, K)
     described: Tensor | None  # (M, ...), where they are pictured
     confidence: Tensor  # (M,)
@@ -480,7 +480,8 @@ def _render(
     found = {}
     for number, other in enumerate(partners):
         if (key, other) in shop.teachers:
-            found[other] = _shown_on(shop, (key, other), weights, turn == number, pictured)
+            chosen = (number - turn) % len(partners) < shop.config.pairs.shown
+            found[other] = _shown_on(shop, (key, other), weights, chosen, pictured)
     return _Pool(weights.to(described), described, seen, turn, found)
 
 

@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import replace
-from itertools import permutations
+from itertools import pairwise, permutations
 
 import pytest
 import torch
@@ -109,9 +109,11 @@ def test_adding_goes_on_where_it_stopped_even_without_the_run_it_began_from(thre
     assert all(torch.equal(expected[name], actual[name]) for name in expected)
 
 
-def test_each_expression_is_shown_on_one_partner_only_whatever_the_size_of_the_cast(toy_config, rig_files, tmp_path):
-    """Counted as what is photographed while the networks learn: twice the pictures of a rig, for every rig."""
-    counts = {}
+@pytest.mark.parametrize(("shown", "growth"), [(1, [0, 0]), (2, [1, 0]), (9, [1, 1])])
+def test_each_expression_is_shown_on_so_many_partners_and_no_more(shown, growth, toy_config, rig_files, tmp_path):
+    """Counted as what is photographed while the networks learn: from a third and a fourth rig on, as much for every
+    rig, or the pictures of its expressions on one partner more."""
+    counts = []
     for size in (2, 3, 4):
         drawn = []
         photograph = Studio.photograph
@@ -121,14 +123,19 @@ def test_each_expression_is_shown_on_one_partner_only_whatever_the_size_of_the_c
             return photograph(self, weights, buffers)
 
         config = replace(
-            toy_config, cast=rig_files[:size], run=str(tmp_path / str(size)), bpnet=_no_renders(toy_config)
+            toy_config,
+            cast=rig_files[:size],
+            run=str(tmp_path / str(size)),
+            bpnet=_no_renders(toy_config),
+            pairs=PairsConfig(shown=shown),
         )
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("reenact.training.save_preview", lambda *_: None)
             patch.setattr(Studio, "photograph", count)
             train(config)
-        counts[size] = sum(drawn)
-    assert counts[4] / 4 == counts[3] / 3 == counts[2] / 2
+        counts.append(sum(drawn) / size)
+    once = toy_config.training.frames * -(-toy_config.training.steps // toy_config.training.refresh)
+    assert [(after - before) / once for before, after in pairwise(counts)] == growth
 
 
 def _no_renders(config):
