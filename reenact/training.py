@@ -976,10 +976,14 @@ def _say_stopped(console: Console, run: Run) -> None:
 
 
 def _say_next(console: Console, run: Run) -> None:
+    folder, between = _quoted(run), ""
     console.print(f"Trained: {run.folder}", soft_wrap=True)
-    console.print(f"  reenact infer {_quoted(run)} CLIP --out result.glb", soft_wrap=True)
-    console.print(f"  reenact evaluate {_quoted(run)}", soft_wrap=True)
-    console.print(f"  reenact view {_quoted(run)}", soft_wrap=True)
+    if run.config.cast:
+        between = f" --from {shlex.quote(run.keys[0])} --to {shlex.quote(run.keys[-1])}"
+        console.print(f"Any of {', '.join(run.keys)} moves any other:", soft_wrap=True)
+    console.print(f"  reenact infer {folder} CLIP{between} --out result.glb", soft_wrap=True)
+    console.print(f"  reenact evaluate {folder}{between}", soft_wrap=True)
+    console.print(f"  reenact view {folder}{between}", soft_wrap=True)
 
 
 def _quoted(run: Run) -> str:

@@ -49,6 +49,13 @@ def trained(monkeypatch):
     return calls
 
 
+def test_the_module_is_the_command():
+    command = [sys.executable, "-m", "reenact", "inspect", "nowhere.glb"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert "error: nowhere.glb: " in done.stderr
+
+
 def test_help_names_every_command(capsys):
     text = explained(capsys, "--help")
     assert all(f"• {name}" in text for name in cli.COMMANDS)

@@ -314,6 +314,9 @@ def test_the_commands_to_go_on_with_can_be_pasted(toy_run):
     _say_next(Console(file=said, markup=False), replace(toy_run, folder=Path("my runs/[b]")))
     for command in ("evaluate", "view"):
         assert f"  reenact {command} 'my runs/[b]'\n" in said.getvalue()
+    cast = replace(toy_run.config, cast=tuple(toy_run.keys))
+    _say_next(Console(file=said, markup=False), replace(toy_run, config=cast, folder=Path("cast")))
+    assert f"  reenact evaluate cast --from {toy_run.keys[0]} --to {toy_run.keys[-1]}\n" in said.getvalue()
 
 
 def _in_compiled_code(interrupt):
