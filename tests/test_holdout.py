@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -31,9 +32,8 @@ def parts(toy_run):
     """All that a holdout of the toys is made of."""
     studios = {key: toy_run.studio(key) for key in toy_run.keys}
     teachers = {
-        pair: toy_run.teacher(studios[pair[0]], studios[pair[1]], *pair)
-        for pair in (toy_run.keys, toy_run.keys[::-1])
-        for pair in [tuple(pair)]
+        (source, target): toy_run.teacher(studios[source], studios[target], source, target)
+        for source, target in permutations(toy_run.keys, 2)
     }
     distances = {key: VertexDistance(studio.rig, studio.typical) for key, studio in studios.items()}
     return studios, toy_run.trained_networks(), teachers, distances
