@@ -181,6 +181,8 @@ def train(config: Config, resume: bool = False) -> Path:
             if resume and workers.leads:
                 migrate(run.folder, run.config)
                 sweep(run.folder / "previews")
+                for name in ("metrics.jsonl", "pairs.json"):  # not others: a viewer may be writing nudges.json
+                    sweep(run.folder, name)
             folder = workers.agree(str(run.folder) if workers.leads else None)
             run = run if workers.leads else Run.open(Path(folder))
             console.print(f"To watch it, elsewhere: reenact view {_quoted(run)}", soft_wrap=True)
