@@ -42,9 +42,10 @@ def replacing(path: Path | str) -> Iterator[Path]:
     _sync_folder(path.parent)
 
 
-def sweep(folder: Path) -> None:
-    """Remove what killed processes left half written in a folder to which no other process writes now."""
-    for leftover in folder.glob(".*.tmp"):
+def sweep(folder: Path, name: str = "") -> None:
+    """Remove what killed processes left half written in a folder to which no other process writes now; or of one file
+    to which none does."""
+    for leftover in folder.glob(f".{name}*.tmp"):
         leftover.unlink(missing_ok=True)
 
 

@@ -4,6 +4,7 @@ A manifest has an item a row, in .csv, .json (a list of objects) or .toml ([[ite
 
 clip, out                       as `reenact infer` takes them; both are needed
 run, from, to                   networks that were trained, and the rigs of a cast
+checkpoint                      of the run: newest, best or a step
 method, source, target          or a geometric method; correspondence may name its pairs of places
 fps                             of the result
 
@@ -64,16 +65,20 @@ class Item:
     target: str | None = None
     correspondence: str | None = None
     fps: float | None = None
+    checkpoint: str | None = None
 
     @property
     def digest(self) -> str:
         """What tells the item from others."""
-        return hashlib.sha256(json.dumps(asdict(self)).encode()).hexdigest()[:16]
+        told = asdict(self)
+        if self.checkpoint is None:
+            del told["checkpoint"]  # as tables of before the key have it
+        return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
 
     @property
     def mover(self) -> tuple[str | None, ...]:
         """What items have in common that one retargeter moves."""
-        kinds = (self.run, self.source_in_run, self.target_in_run, self.method)
+        kinds = (self.run, self.checkpoint, self.source_in_run, self.target_in_run, self.method)
         return *kinds, self.source, self.target, self.correspondence
 
 
@@ -110,11 +115,13 @@ def read_manifest(path: Path) -> list[Item]:
 
 def _item(where: str, row: dict[str, Any]) -> Item:
     known = {key: _NAMES.get(key, key) for key in ("clip", "out", "run", "from", "to", "method", "source", "target")}
-    known |= {"correspondence": "correspondence", "fps": "fps"}
+    known |= {key: key for key in ("checkpoint", "correspondence", "fps")}
     strange = [key for key in row if key not in known]
     if strange:
         raise ReenactError(f"{where}: expected keys among {', '.join(known)}, got {strange[0]}")
     fields = {known[key]: value for key, value in row.items()}
+    if type(fields.get("checkpoint")) is int:
+        fields["checkpoint"] = str(fields["checkpoint"])
     try:
         fps = None if "fps" not in fields else float(fields.pop("fps"))
     except (TypeError, ValueError):
@@ -129,6 +136,8 @@ def _item(where: str, row: dict[str, Any]) -> Item:
         raise ReenactError(f"{where}: expected a run, or a method with source and target, got {', '.join(row)}")
     if item.run is not None and (item.source or item.target or (item.correspondence and not item.method)):
         raise ReenactError(f"{where}: expected from and to beside a run, got source, target or correspondence")
+    if item.checkpoint is not None and (item.run is None or item.method is not None):
+        raise ReenactError(f"{where}: expected the networks of a run beside checkpoint, got {', '.join(row)}")
     if item.method is not None and item.method not in METHODS:
         raise ReenactError(f"{where}: expected a method among {', '.join(METHODS)}, got {item.method}")
     return item
@@ -218,7 +227,8 @@ def _move(item: Item, movers: OrderedDict[tuple, Any]) -> int:
 def _mover(item: Item) -> tuple[Any, str]:
     """What moves an item's clip, and where the target came from."""
     if item.run is not None:
-        found = ImageRetargeter.load(item.run, source=item.source_in_run, target=item.target_in_run)
+        named = {"source": item.source_in_run, "target": item.target_in_run}
+        found = ImageRetargeter.load(item.run, **named, checkpoint=item.checkpoint or "newest")
         origin = dict(zip(found.run.keys, found.run.config.rigs))[found.keys[1]]
         if item.method is None:
             return found, origin

@@ -5,7 +5,8 @@ and a SHA-256 of it all. One file, so that no crash leaves tensors of one step b
 reads or writes pickle: a checkpoint from a stranger cannot run code.
 
     run/checkpoints/step-00000500.safetensors
-    run/checkpoints/latest                      name of the newest, written last
+    run/checkpoints/best                        name of the one whose networks erred least, and by how much
+    run/checkpoints/latest                      name of the newest, written after the others
     run/lock                                    process that trains here
 """
 
@@ -15,6 +16,7 @@ import base64
 import getpass
 import hashlib
 import json
+import math
 import os
 import random
 import re
@@ -53,19 +55,33 @@ class Checkpoint:
     """Parameters, moments and the like by flat name, on the CPU."""
     state: dict[str, Any]
     """Everything that is not a tensor, as it comes out of JSON: tuples have become lists."""
+    error: float | None = None
+    """How wrong the networks were in a check that all checkpoints pass alike; None where there was none."""
 
 
 def save_checkpoint(
-    run_dir: Path, step: int, tensors: dict[str, Tensor], state: dict[str, Any], *, keep: int = 3
+    run_dir: Path,
+    step: int,
+    tensors: dict[str, Tensor],
+    state: dict[str, Any],
+    *,
+    error: float | None = None,
+    keep: int = 3,
+    milestones: int = 0,
 ) -> Path:
-    """The file of a new checkpoint; older ones are removed once it is safe on disk.
+    """The file of a new checkpoint; older ones are removed once it is safe on disk, but for the best and milestones.
+
+    Each file tells its own error. Which is the best is found anew at every save, from the files that are there: what a
+    crash, another version or a hand did to the pointer does not matter.
 
     Args:
         run_dir: Folder of the run.
         step: Optimizer steps done.
         tensors: By flat name; on any device.
         state: Ready for JSON.
+        error: As in `Checkpoint`; what is not finite counts as none.
         keep: Newest checkpoints up to this step that stay.
+        milestones: Checkpoints at multiples of so many steps stay for ever; 0 for none.
 
     Raises:
         OSError: No space, no permission; every earlier checkpoint is still there.
@@ -74,38 +90,63 @@ def save_checkpoint(
     folder.mkdir(parents=True, exist_ok=True)
     sweep(folder)
     copies = _copies(tensors)
-    text = json.dumps({"format": FORMAT, "step": step, "state": state})
+    content = {"format": FORMAT, "step": step, "state": state}
+    if error is not None and math.isfinite(error):
+        content["error"] = error
+    text = json.dumps(content)
     header = {"reenact": text, "sha256": _digest(copies, text)}
     path = folder / f"step-{step:08d}.safetensors"
     write_atomically(path, safetensors.torch.save(copies, metadata=header))
-    write_atomically(folder / "latest", f"{path.name}\n".encode())
     # Later steps than this one are left alone: they are of a run that went back, and its next saves replace them.
-    for old in [file for file in _checkpoints(run_dir) if _step(file) <= step][:-keep]:
-        old.unlink(missing_ok=True)
+    known = [file for file in _checkpoints(run_dir) if _step(file) <= step]
+    ranked = _best_first(known)
+    if ranked:  # before `latest`: a run that is killed in between saves this step again
+        best, least = ranked[0]
+        write_atomically(folder / "best", f"{best.name} {least!r}\n".encode())
+    write_atomically(folder / "latest", f"{path.name}\n".encode())
+    stay = {*known[-keep:], *(file for file, _ in ranked[:1])}
+    for old in known:
+        if old not in stay and not (milestones and _step(old) % milestones == 0):
+            old.unlink(missing_ok=True)
     return path
 
 
-def load_checkpoint(run_dir: Path) -> Checkpoint:
-    """The latest checkpoint that is whole; warns when a newer one is not.
+def load_checkpoint(run_dir: Path, which: str = "newest") -> Checkpoint:
+    """A checkpoint of a run that is whole; warns when another one that comes first is not.
+
+    Args:
+        run_dir: Folder of the run.
+        which: The "newest", the "best" by the errors that they tell, or that of a step, as digits.
 
     Raises:
         MissingError: The run has saved none yet, or there is no such run.
-        ReenactError: None of them can be read, or a newer version of Reenact wrote them.
+        ReenactError: There is no such checkpoint, it cannot be read, or a newer version of Reenact wrote it.
     """
     paths = _newest_first(run_dir)
     if not paths:
         raise MissingError(f"{run_dir}: expected checkpoints in {run_dir / 'checkpoints'}, got none; train it first")
+    if which != "newest":
+        paths = _chosen(run_dir, which)
     for index, path in enumerate(paths):
         try:
             checkpoint = _read(path)
         except (OSError, _Torn) as error:
-            following = f"; going on from {paths[index + 1].name}" if index + 1 < len(paths) else ""
+            verb = "going on from" if which == "newest" else "taking"
+            following = f"; {verb} {paths[index + 1].name}" if index + 1 < len(paths) else ""
             warnings.warn(f"{path}: expected a whole checkpoint, got a damaged one ({error}){following}", stacklevel=2)
         else:
             return checkpoint
+    others = "" if which == "newest" else ", take another checkpoint"
     raise ReenactError(
-        f"{run_dir}: expected a whole checkpoint, got {len(paths)} damaged ones; restore the folder or train again"
+        f"{run_dir}: expected a whole checkpoint, got {len(paths)} damaged ones; restore the folder{others} or train "
+        "again"
     )
+
+
+def best_checkpoint(run_dir: Path) -> tuple[int, float] | None:
+    """Steps and error of the best checkpoint that is there, of those up to the newest; None where none tells."""
+    ranked = _best_first(_up_to_newest(run_dir))
+    return (_step(ranked[0][0]), ranked[0][1]) if ranked else None
 
 
 def has_checkpoint(run_dir: Path) -> bool:
@@ -169,7 +210,7 @@ def _read(path: Path) -> Checkpoint:
         raise ReenactError(
             f"{path}: expected a checkpoint of format {FORMAT} or older, got {version}; update Reenact to read it"
         )
-    return Checkpoint(step=step, tensors=tensors, state=state)
+    return Checkpoint(step=step, tensors=tensors, state=state, error=_told_error(content))
 
 
 def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -205,6 +246,71 @@ def _newest_first(run_dir: Path) -> list[Path]:
     name = pointer.read_text(errors="replace").strip() if pointer.is_file() else ""
     first = next((path for path in paths if path.name == name), paths[0] if paths else None)
     return sorted(paths, key=lambda path: (_step(path) > _step(first), -_step(path)))
+
+
+def _up_to_newest(run_dir: Path) -> list[Path]:
+    """Files of checkpoints, oldest first, without those of an abandoned future."""
+    newest = newest_step(run_dir)
+    return [path for path in _checkpoints(run_dir) if newest is not None and _step(path) <= newest]
+
+
+def _best_first(paths: list[Path]) -> list[tuple[Path, float]]:
+    """Those that tell their error, with it, the least first; of equal ones the earlier."""
+    told = [(path, error) for path in paths if (error := _error(path)) is not None]
+    return sorted(told, key=lambda each: (each[1], _step(each[0])))
+
+
+def _error(path: Path) -> float | None:
+    """What a file tells in its header, whose tensors are not read; None from one that is damaged there.
+
+    Raises:
+        OSError: The disk fails: a file that cannot be read now may be the best, and must not be removed for it.
+    """
+    try:
+        with path.open("rb") as file:
+            size = int.from_bytes(file.read(8), "little")
+            if size > path.stat().st_size:
+                return None
+            return _told_error(json.loads(json.loads(file.read(size))["__metadata__"]["reenact"]))
+    except (FileNotFoundError, RuntimeError, ValueError, LookupError, TypeError):  # gone: another process trains
+        return None
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
+
+
+def _told_error(content: Any) -> float | None:
+    error = content.get("error") if isinstance(content, dict) else None
+    return error if isinstance(error, float) and math.isfinite(error) else None
+
+
+def _chosen(run_dir: Path, which: str) -> list[Path]:
+    """The file of a step; or all that tell their error, the best first, and a word where the pointer lost its own.
+
+    Raises:
+        ReenactError: There is no such checkpoint.
+    """
+    paths, ranked = _checkpoints(run_dir), _best_first(_up_to_newest(run_dir))
+    best = ranked[0][0] if ranked else None
+    chosen = [path for path, _ in ranked] if which == "best" else []
+    if which.isascii() and which.isdecimal():
+        chosen = [path for path in paths if _step(path) == int(which[:20])]
+    if not chosen:
+        steps = ", ".join(f"{_step(path)}{' (best)' * (path == best)}" for path in paths)
+        wanted, come = "newest, best or a step that was saved", which[:40] or "nothing"
+        if which == "best":
+            wanted, come = "one that was checked as it was saved, to be the best", "none"
+        raise ReenactError(f"{run_dir}: checkpoint: expected {wanted}, got {come}; there are those of steps {steps}")
+    pointer = run_dir / "checkpoints" / "best"
+    if which == "best" and pointer.is_file():
+        name = (pointer.read_text(errors="replace").split() or [""])[0]
+        if name not in {path.name for path in paths}:
+            warnings.warn(
+                f"{pointer}: expected the name of a checkpoint that is there, got {name[:40] or 'nothing'}; taking "
+                f"{chosen[0].name}, the best of those that are",
+                stacklevel=3,
+            )
+    return chosen
 
 
 def flatten_optimizer(

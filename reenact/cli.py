@@ -125,6 +125,7 @@ def infer(
     from_: Annotated[str | None, arg(name="from", metavar="RIG")] = None,
     to: Annotated[str | None, arg(metavar="RIG")] = None,
     reverse: Annotated[bool, FlagCreatePairsOff] = False,
+    checkpoint: Annotated[str, arg(metavar="newest|best|STEP")] = "newest",
     device: Literal["cpu", "cuda"] = "cpu",
     fps: float | None = None,
     post: PostConfig = PostConfig(),  # noqa: B008 - frozen
@@ -149,6 +150,7 @@ def infer(
         from_: A rig of the run, by its name; the first unless said.
         to: Another; the second unless said.
         reverse: From the target to the source instead.
+        checkpoint: Of the run: the newest, the best by the held-out error of its saves, or that of a step.
         device: Where the run's networks look at pictures; cuda needs an NVIDIA GPU.
         fps: Frames per second of the result; those of the clip unless said.
         post: What to do to the result.
@@ -170,11 +172,13 @@ def infer(
         from reenact.inference import ImageRetargeter
 
         with _busy("Loading the networks"):
-            retargeter: Any = ImageRetargeter.load(inputs[0], reverse, from_, to, device)
+            retargeter: Any = ImageRetargeter.load(inputs[0], reverse, from_, to, device, checkpoint)
         origins = dict(zip(retargeter.run.keys, retargeter.run.config.rigs))
         names = [origins[key] for key in retargeter.keys]
-        moved = _moved_by_networks(retargeter, inputs[-1])
+        moved, older = _moved_by_networks(retargeter, inputs[-1]), retargeter.older
     else:
+        _check_unchosen("infer", checkpoint, "networks", f"--method {method}")
+        older = None
         named = (from_, to)
         moved, retargeter, names = _geometric(inputs, method, source, target, correspondence, training, reverse, named)
     from reenact.postprocessing import postprocess
@@ -183,7 +187,10 @@ def infer(
     moved = postprocess(_at_rate(moved, fps), post)
     with _busy(f"Writing {out}"):
         save_clip(moved, out, retargeter.target, names[1] if Path(names[1]).is_file() else None)
-    print(f"{out}: {len(moved)} frames, {moved.duration:.1f} s, {retargeter.source.name} -> {retargeter.target.name}")
+    print(
+        f"{out}: {len(moved)} frames, {moved.duration:.1f} s, {retargeter.source.name} -> {retargeter.target.name}"
+        f"{_of_step(older)}"
+    )
 
 
 def batch(
@@ -199,7 +206,7 @@ def batch(
 
     Args:
         manifest: Items as .csv, .json (a list) or .toml ([[item]]): clip and out; run, and from and to for a cast, or
-            method, source and target; correspondence and fps where wanted.
+            method, source and target; checkpoint, correspondence and fps where wanted.
         results: The table; MANIFEST-results.csv beside the manifest unless said.
     """
     results = results or manifest.with_name(f"{manifest.stem}-results.csv")
@@ -226,6 +233,7 @@ def evaluate(
     configs: Annotated[tuple[Path, ...], arg(metavar="FILE.toml")] = (),
     targets: Annotated[tuple[str, ...], arg(metavar="RIG")] = (),
     seeds: int = 3,
+    checkpoint: Annotated[str, arg(metavar="newest|best|STEP")] = "newest",
     take: Annotated[Path | None, arg(metavar="CLIP")] = None,
     results: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None,
     keep: Annotated[Path | None, arg(metavar="FOLDER")] = None,
@@ -247,11 +255,13 @@ def evaluate(
         configs: Settings of networks for the suite.
         targets: Only these built-in characters; the word none leaves them out.
         seeds: How many seeds of clips and training the suite takes, from --seed on.
+        checkpoint: Of each run: the newest, the best by the held-out error of its saves, or that of a step.
         take: A recorded clip of ARKit shapes, measured as well.
         results: Finished cells of the suite: they are not made again, new ones are appended.
         keep: Keep the runs of the suite in this folder.
     """
     if suite is not None:
+        _check_unchosen("evaluate", checkpoint, "runs", f"--suite {suite}")
         chosen = tuple(configs) if suite == "transfer" else ()
         _run_suite(rigs, targets, methods, chosen, frames, range(seed, seed + seeds), take, results, keep)
         return
@@ -268,13 +278,21 @@ def evaluate(
         with console.status(f"{run}") as status:
             results.append(
                 evaluate(
-                    run, frames, seed, lambda stage, run=run, s=status: s.update(f"{run}: {stage}"), methods, from_, to
+                    run,
+                    frames,
+                    seed,
+                    lambda stage, run=run, s=status: s.update(f"{run}: {stage}"),
+                    methods,
+                    from_,
+                    to,
+                    checkpoint,
                 )
             )
         for table in _tables(results[-1]):
             console.print(table)
     with console.status("Writing the report"):
-        page = write_report(list(runs), results, partial(ImageRetargeter.load, source=from_, target=to))
+        load = partial(ImageRetargeter.load, source=from_, target=to, checkpoint=checkpoint)
+        page = write_report(list(runs), results, load)
     console.print(f"Report: {page}", highlight=False, soft_wrap=True)
 
 
@@ -287,6 +305,7 @@ def view(
     nudges: Annotated[Path | None, arg(metavar="FILE.json")] = None,
     from_: Annotated[str | None, arg(name="from", metavar="RIG")] = None,
     to: Annotated[str | None, arg(metavar="RIG")] = None,
+    checkpoint: Annotated[str, arg(metavar="newest|best|STEP")] = "newest",
     fps: float | None = None,
     port: int = 0,
     browser: bool = True,
@@ -304,6 +323,8 @@ def view(
         nudges: Where corrections are kept; RUN/nudges.json unless said, and nowhere without a run.
         from_: A rig of a run of a cast, by its name; the first unless said.
         to: Another; the second unless said.
+        checkpoint: Of the run: the newest, also while it trains; the best by the held-out error of its saves, or that
+            of a step.
         fps: Frames per second to play at; those of the clip unless said.
         port: Of the page's address; any free one unless said.
         browser: Open the page.
@@ -314,7 +335,9 @@ def view(
     from reenact.viewer.session import Session
 
     with Console(stderr=True).status("Loading"):
-        session = Session.open(inputs, clip, method, audio, nudges, fps, from_, to)
+        session = Session.open(inputs, clip, method, audio, nudges, fps, from_, to, checkpoint)
+    if session.older is not None:
+        print(f"{inputs[0]}: networks{_of_step(session.older)}", flush=True)
     serve(session, port, browser)
 
 
@@ -324,6 +347,7 @@ def render(
     out: Annotated[Path, arg(metavar="OUT")],
     rig: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="RIG", help_behavior_hint="(repeatable)")] = (),
     method: Annotated[str | None, arg(metavar="NAME")] = None,
+    checkpoint: Annotated[str, arg(metavar="newest|best|STEP")] = "newest",
     size: int = 512,
     fps: float | None = None,
     audio: Annotated[Path | None, arg(metavar="FILE.wav")] = None,
@@ -338,6 +362,7 @@ def render(
         rig: Who plays the clip, by the names of the shapes; again for another beside it. The rig in the clip's own file
             unless said.
         method: Retarget from the first rig to the others instead; with a run, in place of its networks.
+        checkpoint: Of the run: the newest, the best by the held-out error of its saves, or that of a step.
         size: Height and width of each rig in pixels.
         fps: Frames per second; those of the clip unless said.
         audio: Sound for the .mp4.
@@ -353,7 +378,7 @@ def render(
     check_out(out, audio)
     console = Console(stderr=True)
     with console.status("Loading"):
-        played = performances(inputs, rig, method, fps)
+        played = performances(inputs, rig, method, fps, checkpoint)
     if out.suffix.lower() == ".gif" and fps is None and played[0].clip.fps > GIF_RATE:
         print(f"{played[0].clip.fps:g} frames per second became 30: a .gif has at most {GIF_RATE}")
         played = [replace(each, clip=resampled(each.clip, 30.0)) for each in played]
@@ -361,7 +386,8 @@ def render(
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Drawing", total=len(clip))
         save_video(played, out, size, opengl, audio, lambda done: progress.update(task, completed=done))
-    print(f"{out}: {len(clip)} frames, {clip.duration:.1f} s, {', '.join(each.rig.name for each in played)}")
+    names = ", ".join(each.rig.name for each in played)
+    print(f"{out}: {len(clip)} frames, {clip.duration:.1f} s, {names}{_of_step(played[-1].older)}")
 
 
 def convert(
@@ -761,6 +787,17 @@ def _captured(
     return clip, SimpleNamespace(source=SimpleNamespace(name=f"{len(names)} markers"), target=rig), [take, target]
 
 
+def _check_unchosen(command: str, checkpoint: str, what: str, given: str) -> None:
+    """Refuse a checkpoint where there is nothing that it is of."""
+    if checkpoint != "newest":
+        raise ReenactError(f"{command}: expected {what} beside --checkpoint, got {given}; leave one of them out")
+
+
+def _of_step(older: int | None) -> str:
+    """Whose networks it was, where they are not the newest."""
+    return "" if older is None else f", of step {older:,}"
+
+
 def _infer_defaults(arguments: list[str]) -> PostConfig:
     """Where the post-processing of `infer` starts: as the run's settings say."""
     if arguments[:1] != ["infer"]:
@@ -896,7 +933,8 @@ def _tables(numbers: dict[str, Any]) -> list[Table]:
     columns = {"this run": numbers, "direct": numbers["direct"]}
     columns |= {"pairs": numbers["paired"]} if numbers["paired"] else {}
     columns |= {name.replace("_", " "): row for name, row in numbers["baselines"].items()}
-    title = f"{numbers['run']}: {numbers['source']} -> {numbers['target']}, {numbers['frames']} unseen frames"
+    run = f"{numbers['run']}{_of_step(numbers.get('checkpoint'))}"
+    title = f"{run}: {numbers['source']} -> {numbers['target']}, {numbers['frames']} unseen frames"
     caption = "direct: without ReenactNet" + "; pairs: of shapes, without any network" * bool(numbers["paired"])
     look: dict[str, Any] = {"title_justify": "left", "box": SIMPLE_HEAD, "pad_edge": False}  # 80 columns hold them
     compared = Table(title=title, caption=caption, caption_justify="left", **look)

@@ -189,7 +189,9 @@ class TrainingConfig:
     save_every: int = 1000
     """Steps between checkpoints; each writes a preview picture."""
     keep: int = 3
-    """Newest checkpoints that are kept."""
+    """Newest checkpoints that are kept, besides the best and milestones."""
+    milestones: int = 0
+    """Steps, over all stages, between checkpoints that are kept for ever; 0 keeps none."""
     threads: int | None = None
     """CPU threads; None takes all cores."""
     device: Literal["cpu", "cuda"] = "cpu"
@@ -446,6 +448,7 @@ _ALLOWED: dict[str, _Rule] = {
     "training.seed": ("a whole number from 0 to 2^63 - 1", lambda value: 0 <= value < 2**63),
     "training.save_every": _ONE_OR_MORE,
     "training.keep": _ONE_OR_MORE,
+    "training.milestones": ("a whole number of at least 0", lambda value: value >= 0),
     "training.threads": _ONE_OR_MORE,
     "post.rest": _NOT_NEGATIVE,
     "post.rest_seconds": _POSITIVE,

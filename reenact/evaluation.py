@@ -445,6 +445,7 @@ def evaluate(
     methods: Sequence[str] = (),
     source: str | None = None,
     target: str | None = None,
+    checkpoint: str = "newest",
 ) -> dict:
     """The numbers of a finished run, also written to `RUN/evaluation/metrics.json`.
 
@@ -459,9 +460,11 @@ def evaluate(
         methods: Geometric methods to measure beside it, on the same frames.
         source: A rig of a cast, by any of its names; the run's first unless said.
         target: Another; the second unless said.
+        checkpoint: The "newest", the "best", or a step; see `load_checkpoint`.
 
     Returns:
-        See `evaluate_retargeters`, and `run`, the folder's name.
+        See `evaluate_retargeters`, and `run`, the folder's name; `checkpoint`, the step of the networks where they are
+        not the newest.
 
     Raises:
         ReenactError: Too few frames; an unknown method, or one that cannot work on these rigs; the run cannot be
@@ -478,6 +481,7 @@ def evaluate(
         held_out_clips((), frames, seed)  # raises before the slow loading
     say("loading the networks")
     named = {name: value for name, value in (("source", source), ("target", target)) if value is not None}
+    named |= {} if checkpoint == "newest" else {"checkpoint": checkpoint}
     forward = ImageRetargeter.load(run_dir, **named)
     reverse = ImageRetargeter.load(run_dir, reverse=True, **named)
     others = {}
@@ -486,6 +490,8 @@ def evaluate(
         others[name] = METHODS[name](forward.source, forward.target, _correspondence(forward, name))
     numbers, arrays = evaluate_retargeters(forward, reverse, frames, seed, say, others)
     numbers = {"run": run_dir.resolve().name, **numbers}
+    if forward.older is not None:
+        numbers["checkpoint"] = forward.older
     folder = run_dir / "evaluation"
     folder.mkdir(parents=True, exist_ok=True)
     packed = io.BytesIO()

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from reenact.checkpoint import load_checkpoint, newest_step
 from reenact.data import Studio, check_device
 from reenact.errors import ReenactError
 from reenact.models import Networks
@@ -28,9 +29,18 @@ _CHUNK = 64
 class ImageRetargeter:
     """Moves motion from `source` to `target` through a shared picture space."""
 
-    def __init__(self, run: Run, source: Studio, target: Studio, networks: Networks, keys: tuple[str, str]):
-        """`source` and `target` must be studios of the run that trained the networks, `keys` their keys; see `load`."""
-        self.run = run
+    def __init__(
+        self,
+        run: Run,
+        source: Studio,
+        target: Studio,
+        networks: Networks,
+        keys: tuple[str, str],
+        older: int | None = None,
+    ):
+        """`source` and `target` must be studios of the run that trained the networks, `keys` their keys; `older` is the
+        step of the networks where they are not the newest; see `load`."""
+        self.run, self.older = run, older
         self.source, self.target = source.rig, target.rig
         self.source_studio, self.target_studio = source, target
         self.networks, self.keys = networks, keys
@@ -43,6 +53,7 @@ class ImageRetargeter:
         source: str | None = None,
         target: str | None = None,
         device: str = "cpu",
+        checkpoint: str = "newest",
     ) -> ImageRetargeter:
         """The retargeter that a run trained.
 
@@ -52,17 +63,21 @@ class ImageRetargeter:
             source: A rig of a cast; see `Run.pair`.
             target: Another.
             device: Where pictures are rendered and networks run; clips and what they become stay on the CPU.
+            checkpoint: Whose networks: the "newest", the "best", or a step; see `load_checkpoint`.
 
         Raises:
             FileNotFoundError: There is no run, or nothing was saved yet.
-            ReenactError: The run is damaged, or of another version, or has no such rig; the device is not there.
+            ReenactError: The run is damaged, or of another version, or has no such rig or checkpoint; the device is not
+                there.
         """
         check_device(device)
         run = Run.open(folder)
         keys = run.pair(source, target)
         keys = keys[::-1] if reverse else keys
-        networks = run.trained_networks().to(device)
-        return cls(run, run.studio(keys[0], device), run.studio(keys[1], device), networks, keys)
+        saved = load_checkpoint(run.folder, checkpoint)
+        older = saved.step if checkpoint != "newest" and saved.step != newest_step(run.folder) else None
+        networks = run.trained_networks(saved).to(device)
+        return cls(run, run.studio(keys[0], device), run.studio(keys[1], device), networks, keys, older)
 
     @torch.inference_mode()
     def __call__(self, clip: Clip) -> Clip:

@@ -26,6 +26,8 @@ from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.labels import Labels
 
+LEAST_TRUST = 0.2
+"""In what a teacher says of any expression: doubtful labels of all expressions beat sure ones of a few."""
 _REACH = 0.3
 """Of a correction, in shares of the size of the corrected expression."""
 

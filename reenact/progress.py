@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from reenact.checkpoint import is_training, newest_step
+from reenact.holdout import NUMBER, OWN
 from reenact.run import Run
-from reenact.training import parsed_line, planned_steps
+from reenact.training import next_save, parsed_line, planned_steps
 
 _POINTS = 300
 """Points of a curve at most; each is the mean of what lies around it."""
@@ -45,7 +46,8 @@ class Progress:
     previews: list[int]
     """Steps, over all stages, at which there is a picture."""
     losses: dict[str, list[tuple[float, float]]]
-    """By kind, summed over rigs: steps over all stages, and the loss. "loss" is the sum of all kinds."""
+    """By kind, summed over rigs: steps over all stages, and the loss. "loss" is the sum of all kinds. "held out" is no
+    loss but the number that checkpoints are compared by; see `reenact.holdout`."""
 
 
 def read_progress(run: Run) -> Progress:
@@ -63,8 +65,7 @@ def read_progress(run: Run) -> Progress:
     known = speeds[1:] or speeds
     pace = statistics.harmonic_mean(known[-_LONG:]) if known else None  # for each speaks of as many steps
     state = "finished" if saved == total else "training" if is_training(folder) else "stopped"
-    every = run.config.training.save_every
-    due = before[stage] + min(plan[stage], (step // every + 1) * every)
+    due = before[stage] + next_save(run.config.training, step, plan[stage], before[stage])
     return Progress(
         state=state,
         stage=stage,
@@ -105,8 +106,10 @@ def _curves(rows: list[tuple[float, dict[str, float]]]) -> dict[str, list[tuple[
     for step, numbers in rows:
         kinds: dict[str, float] = {}
         for name, value in numbers.items():
-            if name != "steps_per_second":
-                kind = name.split(".")[0]
+            kind = name.split(".")[0]
+            if name == NUMBER:
+                kinds["held out"] = value
+            elif kind not in (NUMBER, OWN, "steps_per_second"):
                 kinds[kind] = kinds.get(kind, 0.0) + value
         for kind, value in kinds.items():
             curves.setdefault(kind, []).append((step, value))

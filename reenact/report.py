@@ -31,10 +31,12 @@ from torch import Tensor
 from reenact.atomic import write_atomically
 from reenact.errors import ReenactError
 from reenact.evaluation import KINDS, PictureRetargeter, finite, true_weights, vertex_errors
+from reenact.holdout import NUMBER
 from reenact.portrait import Portrait
 from reenact.rigs import arkit
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
+from reenact.training import parsed_line
 
 PLAYER_FRAMES = 96
 """Frames in the player, shared by the runs of a page."""
@@ -70,7 +72,7 @@ def write_report(
     Args:
         run_dirs: Folders of evaluated runs.
         results: What `reenact.evaluation.evaluate` returned for each, or its metrics.json.
-        load: Retargeter of a run folder, for the pictures; None loads the trained networks.
+        load: Retargeter of a run folder, for the pictures; None loads the networks that were evaluated.
 
     Returns:
         Path of the page, RUN/report.html.
@@ -86,7 +88,10 @@ def write_report(
     if load is None:
         from reenact.inference import ImageRetargeter
 
-        load = ImageRetargeter.load
+        def load(folder: Path) -> PictureRetargeter:
+            step = next(each.get("checkpoint") for run, each in zip(run_dirs, results) if Path(run) == folder)
+            return ImageRetargeter.load(folder, **({} if step is None else {"checkpoint": str(step)}))
+
     share = max(24, PLAYER_FRAMES // len(run_dirs))  # a page of many runs stays small enough to send
     runs = [
         _run(index, Path(folder), finite(result), load, share)
@@ -248,6 +253,7 @@ def _figures(result: dict[str, Any]) -> list[dict[str, str]]:
 
 def _facts(folder: Path, result: dict[str, Any]) -> list[tuple[str, str]]:
     facts = [("run", folder.resolve().name), ("held-out frames", f"{result['frames']:,}")]
+    facts += [("networks", f"of step {result['checkpoint']:,}")] if "checkpoint" in result else []
     facts.append(("shapes with a known answer", str(result["shared_shapes"])))
     config = folder / "config.toml"
     if config.is_file():
@@ -308,10 +314,13 @@ def _shared_commands(folders: Sequence[Path], results: Sequence[dict]) -> list[t
 def _options(results: Sequence[dict]) -> str:
     """What `reenact evaluate` was told beside the runs, where all were told the same."""
     first = results[0]
-    if any((each["frames"], each["seed"]) != (first["frames"], first["seed"]) for each in results):
+    asked = [(each["frames"], each["seed"], each.get("checkpoint")) for each in results]
+    if any(each != asked[0] for each in asked):
         return ""
+    chosen = "" if asked[0][2] is None else f" --checkpoint {asked[0][2]}"
     methods = list(dict.fromkeys(name for each in results for name in each.get("methods", {})))
-    return f" --frames {first['frames']} --seed {first['seed']}" + (f" --methods {' '.join(methods)}" * bool(methods))
+    chosen += f" --methods {' '.join(methods)}" * bool(methods)
+    return f" --frames {first['frames']} --seed {first['seed']}{chosen}"
 
 
 def compared(runs: list[dict[str, Any]]) -> str:
@@ -750,18 +759,16 @@ def _every_curve(target: Rig, arrays: dict[str, np.ndarray], result: dict[str, A
 
 
 def _training(path: Path) -> list[dict[str, Any]]:
-    """Loss curves by stage, logarithmic; empty where nothing was logged."""
+    """Loss curves by stage, and those of the held-out error, logarithmic; empty where nothing was logged."""
     if not path.is_file():
         return []
-    stages: dict[str, list[tuple[float, float]]] = {}
-    for line in path.read_text(encoding="utf-8").splitlines():
-        if not line.endswith("}"):  # a crash may leave half a line
-            continue
-        entry = json.loads(line)
-        if entry.get("loss", 0) > 0:
-            stages.setdefault(str(entry["stage"]), []).append((entry["step"], entry["loss"]))
+    stages: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for entry in filter(None, map(parsed_line, path.read_text(encoding="utf-8", errors="replace").splitlines())):
+        for key, words in (("loss", "Training loss"), (NUMBER, "Held-out error")):
+            if isinstance(entry.get(key), float) and 0 < entry[key] < np.inf:
+                stages.setdefault((entry["stage"], words), []).append((entry["step"], entry[key]))
     curves = []
-    for name, rows in stages.items():
+    for (name, words), rows in stages.items():
         steps, losses = np.array(rows, dtype=float).T
         if len(steps) < 2:
             continue
@@ -771,7 +778,8 @@ def _training(path: Path) -> list[dict[str, Any]]:
         x = 1000 * (steps - steps[0]) / max(steps[-1] - steps[0], 1)
         curves.append(
             {
-                "name": name,
+                "name": name if words == "Training loss" else f"{name}: {words.lower()}",
+                "label": f"{words} of {name}",
                 "first": losses[0],
                 "last": losses[-1],
                 "start": int(steps[0]),

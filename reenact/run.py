@@ -8,7 +8,7 @@ layouts.safetensors  sampling grid of each other rig
 correspondences/     pairs of places of the first rig's surface and each other's, where geometry teaches
 base.safetensors     networks of the run that this one adds rigs to
 pairs.json           which shapes of the rigs were found to do the same
-metrics.jsonl        losses by stage and step
+metrics.jsonl        losses by stage and step, and at saves what the networks were worth; see `reenact.holdout`
 checkpoints/         networks, optimizer, position; see `reenact.checkpoint`
 previews/            pictures drawn at each save
 """
@@ -29,7 +29,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from reenact.checkpoint import alive, load_checkpoint, load_tensors, save_tensors
+from reenact.checkpoint import Checkpoint, alive, load_checkpoint, load_tensors, save_tensors
 from reenact.config import Config, PairsConfig, save_config
 from reenact.data import Studio
 from reenact.errors import ReenactError
@@ -261,15 +261,16 @@ class Run:
         torch.manual_seed(self.config.training.seed)
         return Networks({key: len(rig.names) for key, rig in self.rigs.items()}, self.config)
 
-    def trained_networks(self) -> Networks:
-        """The networks of the newest checkpoint, in evaluation mode.
+    def trained_networks(self, saved: Checkpoint | None = None) -> Networks:
+        """The networks of a checkpoint, the newest unless one is given, in evaluation mode.
 
         Raises:
             MissingError: Nothing was saved yet.
             ReenactError: No checkpoint is whole, or they are of other networks.
         """
         networks = self.networks()
-        restore_networks(networks, load_checkpoint(self.folder).tensors, self.folder)
+        saved = load_checkpoint(self.folder) if saved is None else saved
+        restore_networks(networks, saved.tensors, self.folder)
         return networks.eval()
 
     def trained(self) -> dict[str, Tensor]:

@@ -22,7 +22,7 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -39,19 +39,21 @@ from reenact import tensorboard
 from reenact.atomic import sweep, write_atomically
 from reenact.checkpoint import (
     RunLock,
+    best_checkpoint,
     flatten_optimizer,
     load_checkpoint,
     restore_optimizer,
     save_checkpoint,
     save_tensors,
 )
-from reenact.config import Config
+from reenact.config import Config, TrainingConfig
 from reenact.data import Studio, check_device, jitter
 from reenact.errors import ReenactError, interruptions
 from reenact.folder import migrate
+from reenact.holdout import NUMBER, Holdout
 from reenact.losses import VertexDistance, code_distance, weight_distance
 from reenact.models import Networks
-from reenact.pairs import Teacher
+from reenact.pairs import LEAST_TRUST, Teacher
 from reenact.preview import save_preview
 from reenact.run import Run, restore_networks
 from reenact.team import Team, TeamError, team
@@ -60,8 +62,6 @@ _PICTURES_PER_COMPONENT = 6
 """Pictures of each rig, per principal component, from which networks learn what varies before any training."""
 _CHUNK = 64
 """Expressions that are photographed at once; part of what makes a run repeatable."""
-_LEAST_TRUST = 0.2
-"""In what a teacher says of any expression: doubtful labels of all expressions beat sure ones of a few."""
 _NEAR = 64
 """Expressions near each corrected one, of a quarter of all at most."""
 _LOG_EVERY = 20
@@ -181,6 +181,8 @@ def train(config: Config, resume: bool = False) -> Path:
             if resume and workers.leads:
                 migrate(run.folder, run.config)
                 sweep(run.folder / "previews")
+                for name in ("metrics.jsonl", "pairs.json"):  # not others: a viewer may be writing nudges.json
+                    sweep(run.folder, name)
             folder = workers.agree(str(run.folder) if workers.leads else None)
             run = run if workers.leads else Run.open(Path(folder))
             console.print(f"To watch it, elsewhere: reenact view {_quoted(run)}", soft_wrap=True)
@@ -211,14 +213,18 @@ def _train(
     if (stage_index, first) == (0, 0):
         with console.status("Finding what varies in each rig's pictures"):
             _begin(run, shop)
+    with console.status("Photographing expressions to check by"):
+        holdout = _holdout(shop) if workers.leads else None
     done = sum(stage.steps for stage in stages[:stage_index])
     board = tensorboard.Board(run.folder, config.training.tensorboard and workers.leads, done + first)
 
     def keep(log: _Log, optimizer: torch.optim.Optimizer, index: int, step: int) -> None:
         """Save so many steps of a stage, if this process is the one that writes."""
         if workers.leads:
-            log.flush()
-            _save(run, lock, networks, optimizer, index, step, done + step)
+            numbers = _check(holdout, shop, index, console)
+            log.flush(numbers)
+            _save(run, lock, networks, optimizer, index, step, done + step, numbers.get(NUMBER))
+            _say_saved(console, run, stages[index].name, done + step, numbers)
 
     with _progress(console) as show, interrupts.patiently(), board:
         for index, stage in list(enumerate(stages))[stage_index:]:
@@ -261,10 +267,10 @@ def _train(
                         "last checkpoint is intact, lower the learning rate and train again"
                     )
                 optimizer.step()
-                log.add(step, losses)
+                due = stop or next_save(config.training, step, stage.steps, done) == step + 1
+                log.add(step, losses, hold=due)
                 show(stage.name, step + 1, stage.steps, log.recent)
-                last = step + 1 == stage.steps
-                if last or (step + 1) % config.training.save_every == 0 or stop:
+                if due:
                     saved = step + 1
                     keep(log, optimizer, index, step + 1)
                     if workers.leads and not stop:
@@ -273,6 +279,21 @@ def _train(
                     _say_stopped(console, run)
                     raise interrupts.asked or SystemExit(128 + signal.SIGTERM)  # another process was asked
             done, first, optimizer = done + stage.steps, 0, None
+
+
+def next_save(training: TrainingConfig, step: int, steps: int, before: int) -> int:
+    """At which step of a stage the next checkpoint is due: its end, what the settings say, or a milestone.
+
+    Args:
+        training: Says how often.
+        step: Steps of the stage that are done.
+        steps: Of the whole stage.
+        before: Steps of the stages before it.
+    """
+    due = [steps, (step // training.save_every + 1) * training.save_every]
+    if training.milestones:
+        due.append(((before + step) // training.milestones + 1) * training.milestones - before)
+    return min(due)
 
 
 def learning_rate(step: int, steps: int, peak: float, schedule: str) -> float:
@@ -327,6 +348,30 @@ def _begin(run: Run, shop: _Workshop) -> None:
     else:
         networks.fit(list(shop.studios), lambda key: survey(key, count))
     shop.team.follow(*networks.state_dict().values())
+
+
+def _holdout(shop: _Workshop) -> Holdout:
+    """What the networks are checked with at every save; the same whenever the run goes on."""
+    training = shop.config.training
+    arguments = (shop.networks, shop.teachers, shop.vertex_distances, shop.learning)
+    return Holdout(shop.studios, *arguments, training.seed, training.frames)
+
+
+def _read_by(keys: Iterable[str], together: bool, stage: int) -> list[str]:
+    """Keys of the rigs whose BPNet has learnt by some stage, the one at work included."""
+    return [key for index, key in enumerate(keys) if together or index + 1 <= stage]
+
+
+def _check(holdout: Holdout | None, shop: _Workshop, stage: int, console: Console) -> dict[str, float]:
+    """What the holdout says, as far as it is finite; a failing check never stops training, and no save."""
+    if holdout is None:
+        return {}
+    try:
+        numbers = holdout(shop.networks, _read_by(shop.studios, shop.config.training.together, stage))
+    except Exception as error:
+        console.print(f"check skipped: {error}", soft_wrap=True)
+        return {}
+    return {name: value for name, value in numbers.items() if math.isfinite(value)}
 
 
 def _summed(
@@ -492,7 +537,7 @@ def _shown_on(shop: _Workshop, pair: tuple[str, str], weights: Tensor, chosen: T
     index = torch.where(chosen, chosen.cumsum(0) - 1, -1)
     weights = weights[chosen]
     theirs = teacher.weights(weights)
-    trust = teacher.confidence(weights, theirs).clamp_min(_LEAST_TRUST)
+    trust = teacher.confidence(weights, theirs).clamp_min(LEAST_TRUST)
     described = None
     if pictured:
         described = shop.team.map(
@@ -748,8 +793,10 @@ def _save(
     stage: int,
     step: int,
     total: int,
+    error: float | None = None,
 ) -> None:
-    """`stage` and `step` are where to go on; `total` counts steps over all stages and names the checkpoint.
+    """`stage` and `step` are where to go on; `total` counts steps over all stages and names the checkpoint, `error` is
+    what the best is chosen by.
 
     Raises:
         ReenactError: Another process trains in the folder by now, or a number in a network or optimizer is not finite.
@@ -766,7 +813,8 @@ def _save(
             "checkpoint is intact, lower the learning rate and train again"
         )
     state = {"stage": stage, "step": step, "optimizer": optimizer_state}
-    save_checkpoint(run.folder, total, tensors, state, keep=run.config.training.keep)
+    keep, milestones = run.config.training.keep, run.config.training.milestones
+    save_checkpoint(run.folder, total, tensors, state, error=error, keep=keep, milestones=milestones)
 
 
 def _restore(run: Run, networks: Networks, stages: list[_Stage]) -> tuple[int, int, torch.optim.Optimizer | None]:
@@ -810,20 +858,23 @@ class _Log:
             kept = [line for line in lines if line["stage"] != stage or line["step"] <= step]
             write_atomically(path, "".join(json.dumps(line) + "\n" for line in kept).encode())
 
-    def add(self, step: int, losses: dict[str, Tensor]) -> None:
+    def add(self, step: int, losses: dict[str, Tensor], hold: bool = False) -> None:
+        """Take in the losses of a step; `hold` leaves the line to a `flush` that follows at once."""
         for name, value in losses.items():
             self.pending.setdefault(name, []).append(float(value.detach()))
         self.step = step + 1
-        if self.step - self.last >= _LOG_EVERY:
+        if self.step - self.last >= _LOG_EVERY and not hold:
             self.flush()
 
-    def flush(self) -> None:
-        if not self.pending:
+    def flush(self, beside: dict[str, float] | None = None) -> None:
+        """Write a line where there is anything to tell; numbers `beside` the losses are not summed with them."""
+        if not self.pending and not beside:
             return
-        now = time.perf_counter()
-        self.recent = {name: float(np.mean(values)) for name, values in self.pending.items()}
-        speed = (self.step - self.last) / (now - self.started)
-        numbers = {"loss": sum(self.recent.values()), **self.recent, "steps_per_second": speed}
+        now, numbers = time.perf_counter(), dict(beside or {})
+        if self.pending:
+            self.recent = {name: float(np.mean(values)) for name, values in self.pending.items()}
+            speed = (self.step - self.last) / (now - self.started)
+            numbers = {"loss": sum(self.recent.values()), **self.recent, **numbers, "steps_per_second": speed}
         line = {"stage": self.stage, "step": self.step, **numbers}
         self.tell(self.step, numbers)
         if self.path is not None:
@@ -844,7 +895,7 @@ def _preview(
     """A failing preview never stops training."""
     try:
         together = run.config.training.together
-        trained = [key for index, key in enumerate(studios) if together or index + 1 <= stage]
+        trained = _read_by(studios, together, stage)
         networks.eval()
         path = run.folder / "previews" / f"{total:06d}.png"
         save_preview(path, studios, networks, trained)
@@ -969,6 +1020,16 @@ class _Output:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
             except OSError:
                 self._stream = io.StringIO()
+
+
+def _say_saved(console: Console, run: Run, stage: str, total: int, numbers: dict[str, float]) -> None:
+    """What a save is worth, where it was checked."""
+    found = best_checkpoint(run.folder) if NUMBER in numbers else None
+    if found is not None:
+        step, least = found
+        place = "the best so far" if step == total else f"the best is {least:.4f} of step {step:,}"
+        words = f"{stage}: saved step {total:,}, held-out error {numbers[NUMBER]:.4f}, {place}"
+        console.print(words, soft_wrap=True)
 
 
 def _say_stopped(console: Console, run: Run) -> None:

@@ -25,7 +25,7 @@ from reenact.rigs.clip import Clip
 from reenact.rigs.files import load_clip, load_rig
 from reenact.rigs.rig import Rig
 from reenact.rigs.timeline import resampled
-from reenact.viewer.session import DEFAULT_CLIP, Session
+from reenact.viewer.session import DEFAULT_CLIP, TRAINED, Session
 from render.opengl import render_opengl
 
 SUFFIXES = (".mp4", ".gif", "")
@@ -45,10 +45,16 @@ class Performance:
 
     rig: Rig
     clip: Clip
+    older: int | None = None
+    """Step of the networks that moved it, where they are not the newest of their run."""
 
 
 def performances(
-    inputs: Sequence[str], rigs: Sequence[str] = (), method: str | None = None, fps: float | None = None
+    inputs: Sequence[str],
+    rigs: Sequence[str] = (),
+    method: str | None = None,
+    fps: float | None = None,
+    checkpoint: str = "newest",
 ) -> list[Performance]:
     """Who plays what, frame by frame together.
 
@@ -58,6 +64,7 @@ def performances(
             clip's own file.
         method: Retargets the clip from the first rig to the others instead; of a run, what takes the networks' place.
         fps: Frames per second; the clip's unless said.
+        checkpoint: Of the run; see `load_checkpoint`.
 
     Raises:
         ReenactError: Something is missing, too much, or cannot be read.
@@ -68,9 +75,14 @@ def performances(
         raise ReenactError(
             f"render: expected CLIP and --rig, or RUN and CLIP, got {len(inputs)} arguments and {len(rigs)} rigs"
         )
+    if checkpoint != "newest" and (not is_run or method not in (None, *TRAINED)):
+        raise ReenactError(
+            f"render: expected the networks of a run beside --checkpoint, got "
+            f"{'no run' if not is_run else f'--method {method}'}; leave one of them out"
+        )
     if is_run:
-        session = Session.open([inputs[0]], inputs[1] if len(inputs) == 2 else DEFAULT_CLIP, method, fps=fps)
-        return _played(session)
+        clip = inputs[1] if len(inputs) == 2 else DEFAULT_CLIP
+        return _played(Session.open([inputs[0]], clip, method, fps=fps, checkpoint=checkpoint))
     clip = inputs[0]
     names = list(rigs) or [clip]
     if method is not None:
@@ -185,7 +197,8 @@ def _played(session: Session) -> list[Performance]:
     found = []
     for key, rig in session.rigs.items():
         pieces = session.track(key, session.first_method.get(key, "clip"))
-        found.append(Performance(rig, Clip(rig.names, torch.cat(list(pieces)), session.clip.fps)))
+        older = None if key == session.source else session.older
+        found.append(Performance(rig, Clip(rig.names, torch.cat(list(pieces)), session.clip.fps), older))
     return found
 
 

@@ -114,6 +114,23 @@ def toy_run(toy_config, tmp_path_factory):
     return run
 
 
+@pytest.fixture
+def older_run(toy_run, tmp_path):
+    """The folder of a run of the toys with three checkpoints, of which the second is the best: steps 10, 20 and 30."""
+    from reenact.checkpoint import save_checkpoint
+
+    folder = tmp_path / "older"
+    shutil.copytree(toy_run.folder, folder)
+    shutil.rmtree(folder / "checkpoints")
+    for step, error in ((10, 0.5), (20, 0.25), (30, 0.4)):
+        networks = toy_run.trained_networks()
+        for bpnet in networks.bpnets.values():
+            list(bpnet.parameters())[-1].data.fill_(step / 40)  # what the last layer adds to everything
+        tensors = {f"networks.{name}": tensor for name, tensor in networks.state_dict().items()}
+        save_checkpoint(folder, step, tensors, {}, error=error)
+    return folder
+
+
 @pytest.fixture(scope="module")
 def chromium():
     """A browser without a window, whose 3D is drawn by software."""

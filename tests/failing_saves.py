@@ -25,13 +25,13 @@ def main(folder: Path) -> None:
     library.fail_names.restype = ctypes.c_char_p
     run, first = folder / "run", folder / "first"
     for step in (1, 2):
-        save_checkpoint(first, step, {"w": torch.full((5000,), float(step))}, {"step": step}, keep=2)
+        save_checkpoint(first, step, {"w": torch.full((5000,), float(step))}, {"step": step}, error=1.0 / step, keep=2)
 
     def save(number: int, error: int) -> bool:
         """Whether the save, whose third checkpoint replaces the first, raised."""
         library.fail_arm(number, error)
         try:
-            save_checkpoint(run, 3, {"w": torch.full((5000,), 3.0)}, {"step": 3}, keep=2)
+            save_checkpoint(run, 3, {"w": torch.full((5000,), 3.0)}, {"step": 3}, error=0.1, keep=2)
         except OSError:
             return True
         finally:
@@ -59,6 +59,8 @@ def main(folder: Path) -> None:
                 warnings.simplefilter("error")  # of a checkpoint that is not whole
                 try:
                     loaded = load_checkpoint(run)
+                    if load_checkpoint(run, "best").step != loaded.step:
+                        raise AssertionError("another one is the best")
                 except Exception as error:
                     found["wrong"].append(f"{call}: {error}")
                     continue

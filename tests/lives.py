@@ -20,7 +20,7 @@ import torch
 from make_fixture_run import ball
 
 from reenact import checkpoint
-from reenact.checkpoint import load_checkpoint
+from reenact.checkpoint import best_checkpoint, load_checkpoint
 from reenact.cli import main as reenact
 from reenact.config import (
     BPNetConfig,
@@ -122,7 +122,7 @@ def die_inside_a_save(number: int):
 
 
 def outcome(run: Path) -> dict:
-    """All that has to be equal: weights, optimizer, metrics, and what a clip becomes."""
+    """All that has to be equal: weights, optimizer, metrics, the best checkpoint, and what a clip becomes."""
     saved = load_checkpoint(run)
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     retargeter = ImageRetargeter.load(run)
@@ -134,6 +134,7 @@ def outcome(run: Path) -> dict:
         "weights": networks_state(saved.tensors),
         "metrics": [{key: value for key, value in line.items() if key != "steps_per_second"} for line in lines],
         "moved": moved,
+        "best": (best_checkpoint(run), (run / "checkpoints" / "best").read_text()),
     }
 
 
@@ -182,7 +183,7 @@ def kills(folder: Path, seed: int, count: int, in_saves: int) -> dict:
         found["wrong"] += [f"{run.name}: {word}" for word in differs(expected, outcome(run), tuple(expected))]
         found["wrong"] += [f"left behind: {path.name}" for path in run.rglob(".*")]
         # A kill at the very end, between the last save and the removal of what it replaces, leaves one too many.
-        if len(list(run.glob("checkpoints/step-*"))) > config.training.keep + 1:
+        if len(list(run.glob("checkpoints/step-*"))) > config.training.keep + 1 + 1:  # and the best
             found["wrong"].append(f"{run.name}: old checkpoints stayed")
         shutil.rmtree(run)
     found["wrong"] += [f"left behind: {path.name}" for path in folder.glob(".*")]

@@ -157,3 +157,30 @@ def test_what_is_no_manifest_or_no_table_is_refused(rows, tmp_path):
         run_batch(_manifest(tmp_path, rows), tmp_path / "other.csv")
     rows[0]["out"] = f"{tmp_path / 'nowhere' / 'x.csv'}"
     assert run_batch(_manifest(tmp_path, rows[:1]), tmp_path / "results.csv")[0] == 1
+
+
+def test_items_name_the_checkpoint_of_their_networks(older_run, tmp_path):
+    names = (None, "best", 10, 7)
+    rows = [
+        {"run": f"{older_run}", "clip": "synthetic:3:1", "out": f"{tmp_path / f'{name}.csv'}"}
+        | ({} if name is None else {"checkpoint": name})
+        for name in names
+    ]
+    failed, made = run_batch(_manifest(tmp_path, rows), tmp_path / "results.csv")
+    assert failed == 1
+    assert "got 7; there are those of steps 10, 20 (best), 30" in made[3]["error"]
+    moved = {name: ImageRetargeter.load(older_run, checkpoint=name) for name in ("newest", "best", "10")}
+    for name, key in ((None, "newest"), ("best", "best"), (10, "10")):
+        retargeter = moved[key]
+        expected = retargeter(load_clip("synthetic:3:1", retargeter.source)).weights
+        found = load_clip(f"{tmp_path / f'{name}.csv'}", retargeter.target).weights
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)  # as many digits as a table has
+    alone = {"method": "copy", "source": "a", "target": "b", "clip": "c", "out": "d", "checkpoint": "best"}
+    with pytest.raises(ReenactError, match="item 1: expected the networks of a run beside checkpoint, got method"):
+        read_manifest(_manifest(tmp_path, [alone]))
+
+
+def test_an_item_without_a_checkpoint_is_told_as_it_was_before_there_was_the_key():
+    item = Item("clip.csv", "out.csv", run="runs/a", fps=25.0)
+    assert item.digest == "faba46500fcabda3"
+    assert Item("clip.csv", "out.csv", run="runs/a", fps=25.0, checkpoint="best").digest != item.digest

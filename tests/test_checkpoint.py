@@ -19,6 +19,7 @@ from torch import nn
 from reenact import checkpoint as module
 from reenact.checkpoint import (
     RunLock,
+    best_checkpoint,
     flatten_optimizer,
     has_checkpoint,
     load_checkpoint,
@@ -103,6 +104,153 @@ def test_checkpoints_are_ordered_by_step_when_the_pointer_is_lost(tmp_path):
     assert load_checkpoint(tmp_path).step == 100_000_000
 
 
+ERRORS = {10: 0.5, 20: 0.25, 30: 0.75, 40: None, 50: 0.25, 60: 0.3}
+"""By step; of equal ones the earlier is the best."""
+
+
+def _saved(run_dir, steps=tuple(ERRORS), **settings):
+    for step in steps:
+        save_checkpoint(run_dir, step, {"w": torch.full((50,), float(step))}, {}, error=ERRORS[step], **settings)
+
+
+def _pointer(run_dir):
+    return (run_dir / "checkpoints" / "best").read_text()
+
+
+def test_the_best_and_the_milestones_stay_beside_the_newest(tmp_path):
+    _saved(tmp_path, keep=2, milestones=30)
+    assert steps_on_disk(tmp_path) == [20, 30, 50, 60]
+    assert _pointer(tmp_path) == "step-00000020.safetensors 0.25\n"
+    assert best_checkpoint(tmp_path) == (20, 0.25)
+    best = load_checkpoint(tmp_path, "best")
+    assert (best.step, best.error, best.tensors["w"][0].item()) == (20, 0.25, 20.0)
+    assert load_checkpoint(tmp_path).step == 60
+    assert load_checkpoint(tmp_path, "30").step == 30
+
+
+def test_a_better_one_takes_the_place_of_the_best(tmp_path):
+    _saved(tmp_path, (10, 30, 60, 20, 40), keep=1)
+    assert steps_on_disk(tmp_path) == [20, 40, 60]  # 60 was the future when 20 and 40 were saved
+    _saved(tmp_path, (10, 20), keep=1)
+    assert _pointer(tmp_path).startswith("step-00000020")
+
+
+def test_the_best_of_an_abandoned_future_is_not_the_best(tmp_path):
+    _saved(tmp_path, (10, 20), keep=3)
+    save_checkpoint(tmp_path, 15, {}, {}, error=0.6, keep=3)
+    assert _pointer(tmp_path) == "step-00000010.safetensors 0.5\n"
+    assert load_checkpoint(tmp_path, "best").step == 10
+    assert load_checkpoint(tmp_path, "20").step == 20  # still there for those who ask
+
+
+def test_checkpoints_that_nobody_checked_have_no_best(tmp_path):
+    for step in (10, 20, 30):
+        save_checkpoint(tmp_path, step, {}, {}, error=float("nan") if step == 30 else None, keep=2)
+    assert steps_on_disk(tmp_path) == [20, 30]
+    assert not (tmp_path / "checkpoints" / "best").exists()
+    assert best_checkpoint(tmp_path) is None
+    with pytest.raises(ReenactError, match=r"expected one that was checked .* got none; there are those of steps 20, "):
+        load_checkpoint(tmp_path, "best")
+
+
+@pytest.mark.parametrize("which", ["45", "last", "", "-20", "²", "9" * 5000])
+def test_a_checkpoint_that_is_not_there_is_refused_with_those_that_are(which, tmp_path):
+    _saved(tmp_path, keep=2)
+    with pytest.raises(
+        ReenactError, match=r"expected newest, best or a step .*; there are those of steps 20 \(best\), 50"
+    ):
+        load_checkpoint(tmp_path, which)
+
+
+@pytest.mark.parametrize("text", ["", "\xff\x00", "step-00000007.safetensors 0.1", "../../x 0.1", "[1]"])
+def test_a_damaged_pointer_to_the_best_is_told_and_mended_by_the_next_save(text, tmp_path):
+    _saved(tmp_path, (10, 20, 30))
+    (tmp_path / "checkpoints" / "best").write_bytes(text.encode("latin-1"))
+    with pytest.warns(
+        UserWarning, match=r"best: expected the name of a checkpoint that is there, got .*; taking step-0*20"
+    ):
+        assert load_checkpoint(tmp_path, "best").step == 20
+    assert load_checkpoint(tmp_path).step == 30
+    _saved(tmp_path, (40,))
+    assert _pointer(tmp_path) == "step-00000020.safetensors 0.25\n"
+
+
+def test_a_lost_pointer_to_the_best_loses_nothing(tmp_path):
+    _saved(tmp_path, (10, 20, 30))
+    (tmp_path / "checkpoints" / "best").unlink()
+    assert load_checkpoint(tmp_path, "best").step == 20
+    (tmp_path / "checkpoints" / "step-00000020.safetensors").unlink()  # as a version does that knows of no best
+    assert load_checkpoint(tmp_path, "best").step == 10
+    _saved(tmp_path, (40,))
+    assert _pointer(tmp_path) == "step-00000010.safetensors 0.5\n"
+
+
+@pytest.mark.parametrize("place", [0, 40, -1])  # the length of the header, the header, the tensors
+def test_a_damaged_best_falls_back_to_the_next_with_a_word(place, tmp_path):
+    _saved(tmp_path, (10, 20, 30), keep=1)
+    _saved(tmp_path, (40,), keep=2)
+    assert steps_on_disk(tmp_path) == [20, 30, 40]
+    path = tmp_path / "checkpoints" / "step-00000020.safetensors"
+    data = bytearray(path.read_bytes())
+    data[place] ^= 255
+    path.write_bytes(data)
+    if place == -1:
+        with pytest.warns(UserWarning, match=r"step-00000020.*damaged.*; taking step-00000030"):
+            assert load_checkpoint(tmp_path, "best").step == 30
+    else:  # what it tells cannot be read
+        assert load_checkpoint(tmp_path, "best").step == 30
+    with (
+        pytest.warns(UserWarning, match="damaged"),
+        pytest.raises(ReenactError, match="take another checkpoint or train"),
+    ):
+        load_checkpoint(tmp_path, "20")
+
+
+def test_a_disk_that_fails_to_tell_what_a_checkpoint_is_worth_removes_none(tmp_path, monkeypatch):
+    _saved(tmp_path, (20, 30), keep=2)
+    real = module.json.loads
+    monkeypatch.setattr(module.json, "loads", lambda _: (_ for _ in ()).throw(OSError(errno.EIO, "Input/output error")))
+    with pytest.raises(OSError, match=r"Input/output error: '.*step-00000020"):
+        _saved(tmp_path, (40,), keep=1)
+    monkeypatch.setattr(module.json, "loads", real)
+    assert steps_on_disk(tmp_path) == [20, 30, 40]
+    assert load_checkpoint(tmp_path).step == 30
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.parametrize("number", range(1, 19))
+def test_a_save_that_is_killed_anywhere_leaves_a_best_that_is_there(number, tmp_path):
+    """A child ends at some call of the system; what is left must load, and the same save again must end as unbroken."""
+    _saved(tmp_path / "run", (10, 20, 30), keep=1)
+    child = os.fork()
+    if child == 0:
+        left = [number]
+
+        def mortal(call):
+            def wrapped(*arguments, **keywords):
+                left[0] -= 1
+                if left[0] == 0:
+                    os._exit(9)
+                return call(*arguments, **keywords)
+
+            return wrapped
+
+        for name in ("fsync", "replace", "open", "unlink", "close"):
+            setattr(os, name, mortal(getattr(os, name)))
+        save_checkpoint(tmp_path / "run", 60, {"w": torch.full((50,), 60.0)}, {}, error=0.1, keep=1)
+        os._exit(0)
+    died = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+    assert died == (number <= 17)  # five calls for each of three files, and two removals
+    assert load_checkpoint(tmp_path / "run").step in (30, 60)
+    assert (tmp_path / "run" / "checkpoints" / _pointer(tmp_path / "run").split()[0]).is_file()
+    assert load_checkpoint(tmp_path / "run", "best").step == (
+        20 if load_checkpoint(tmp_path / "run").step == 30 else 60
+    )
+    save_checkpoint(tmp_path / "run", 60, {"w": torch.full((50,), 60.0)}, {}, error=0.1, keep=1)
+    assert _pointer(tmp_path / "run") == "step-00000060.safetensors 0.1\n"
+    assert steps_on_disk(tmp_path / "run") == [60]
+
+
 @pytest.mark.parametrize("damage", ["empty", "torn", "header", "bit", "state", "foreign"])
 def test_a_damaged_newest_falls_back_to_the_one_before_with_a_warning(damage, tmp_path):
     save_checkpoint(tmp_path, 1, {"w": torch.ones(100)}, {"a": 1})
@@ -162,10 +310,11 @@ def test_no_checkpoint_is_said_so(tmp_path):
 
 @pytest.mark.parametrize(
     ("call", "number"),
-    [*(("fsync", number) for number in range(4)), ("replace", 0), ("replace", 1), ("open", 0), ("open", 1)],
-)  # two files, each with its folder
+    [("fsync", number) for number in range(6)]
+    + [(call, number) for call in ("replace", "open") for number in range(3)],
+)  # three files, each with its folder
 def test_a_save_that_fails_anywhere_says_so_and_leaves_a_checkpoint_that_loads(call, number, tmp_path, monkeypatch):
-    save_checkpoint(tmp_path, 1, {"w": torch.ones(5)}, {}, keep=1)
+    save_checkpoint(tmp_path, 1, {"w": torch.ones(5)}, {}, error=0.5, keep=1)
     real, calls = getattr(os, call), iter(range(100))
 
     def fail(*arguments, **keywords):
@@ -175,8 +324,9 @@ def test_a_save_that_fails_anywhere_says_so_and_leaves_a_checkpoint_that_loads(c
 
     monkeypatch.setattr(os, call, fail)
     with pytest.raises(OSError, match="No space left"):
-        save_checkpoint(tmp_path, 2, {"w": torch.zeros(5)}, {}, keep=1)
+        save_checkpoint(tmp_path, 2, {"w": torch.zeros(5)}, {}, error=0.4, keep=1)
     monkeypatch.undo()
+    assert load_checkpoint(tmp_path, "best").step == load_checkpoint(tmp_path).step
     found = load_checkpoint(tmp_path)
     assert found.tensors["w"].tolist() == [float(found.step == 1)] * 5
     assert not list((tmp_path / "checkpoints").glob(".*"))

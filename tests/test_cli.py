@@ -86,6 +86,7 @@ def test_help_names_every_command(capsys):
                 "--from RIG",
                 "--to RIG",
                 "--reverse",
+                "--checkpoint newest|best|STEP",
                 "--fps",
                 "--post.gain",
                 "Live Link Face",
@@ -93,9 +94,35 @@ def test_help_names_every_command(capsys):
         ),
         ("add", ["RUN", "RIG", "--run DIR", "--steps"]),
         ("batch", ["MANIFEST", "--results FILE.csv", "torchrun"]),
-        ("evaluate", ["[RUN ...]", "--frames INT", "--seed INT", "--suite", "--methods NAME"]),
-        ("view", ["RUN|RIG", "--clip CLIP", "--method NAME", "--audio FILE.wav", "--nudges FILE.json", "--no-browser"]),
-        ("render", ["[RUN] CLIP", "--out OUT", "--rig RIG", "--size INT", "--fps", "--opengl", "side by side"]),
+        (
+            "evaluate",
+            ["[RUN ...]", "--frames INT", "--checkpoint newest|best|STEP", "--seed INT", "--suite", "--methods NAME"],
+        ),
+        (
+            "view",
+            [
+                "RUN|RIG",
+                "--clip CLIP",
+                "--checkpoint newest|best|STEP",
+                "--method NAME",
+                "--audio FILE.wav",
+                "--nudges FILE.json",
+                "--no-browser",
+            ],
+        ),
+        (
+            "render",
+            [
+                "[RUN] CLIP",
+                "--checkpoint newest|best|STEP",
+                "--out OUT",
+                "--rig RIG",
+                "--size INT",
+                "--fps",
+                "--opengl",
+                "side by side",
+            ],
+        ),
         ("convert", ["IN", "OUT", "--rig RIG", "--parts NAME", "--fps", "--post.smooth FLOAT"]),
         ("inspect", ["--out FILE.png", "--json FILE.json", "--parts NAME", "looks wrong"]),
         ("rigs", ["--out FILE.png", "--size INT"]),
@@ -529,3 +556,66 @@ def test_a_long_clip_passes_through_networks_in_parts_as_it_would_whole(toy_rig,
     assert torch.equal(moved.weights, weights.flip(1))
     assert (moved.fps, moved.names) == (24.0, toy_rig.names)
     assert turned.seen == [512, 512, 76]
+
+
+def test_commands_take_the_checkpoint_that_is_asked_for_and_name_it(older_run, tmp_path, capsys):
+    command = ["infer", f"{older_run}", "synthetic:1:1", "--out", f"{tmp_path / 'x.csv'}", "--checkpoint"]
+    for which, said in (("newest", "ball -> egg"), ("best", "ball -> egg, of step 20"), ("10", "egg, of step 10")):
+        assert main([*command, which]) == 0
+        assert capsys.readouterr().out.endswith(f"{said}\n")
+    command = ["render", f"{older_run}", "synthetic:1:1", "--out", f"{tmp_path / 'x.gif'}", "--size", "16"]
+    assert main([*command, "--checkpoint", "best"]) == 0
+    assert capsys.readouterr().out.endswith("ball, egg, of step 20\n")
+    for first in (["infer"], ["render"], ["view"], ["evaluate"]):
+        clip = [] if first == ["evaluate"] else ["synthetic:1:1"] if first != ["view"] else ["--clip", "synthetic:1:1"]
+        out = ["--out", tmp_path / "y.gif"] if first == ["render"] else ["--out", tmp_path / "y.csv"]
+        out = out if first in (["infer"], ["render"]) else []
+        sentence = fails(capsys, *first, older_run, *clip, *out, "--checkpoint", "15")
+        assert "expected newest, best or a step that was saved, got 15; there are those of steps 10, 20 (best), 30" in (
+            sentence
+        )
+
+
+def test_a_checkpoint_without_networks_is_refused(older_run, toy_config, tmp_path, capsys):
+    rigs = [toy_config.source, toy_config.target]
+    out, best = ["--out", tmp_path / "x.csv"], ["--checkpoint", "best"]
+    clip = "synthetic:1:1"
+    for words, *arguments in (
+        (
+            "infer: expected networks beside --checkpoint, got --method copy",
+            "infer",
+            older_run,
+            clip,
+            "--method",
+            "copy",
+        ),
+        ("view: expected a run beside --checkpoint, got ", "view", *rigs),
+        ("evaluate: expected runs beside --checkpoint, got --suite geometric", "evaluate", "--suite", "geometric"),
+        ("render: expected the networks of a run beside --checkpoint, got no run", "render", clip, "--rig", rigs[0]),
+        ("beside --checkpoint, got --method copy", "render", older_run, clip, "--method", "copy"),
+    ):
+        into = {"infer": out, "render": ["--out", tmp_path / "x.gif"]}.get(arguments[0], [])
+        sentence = fails(capsys, *arguments, *into, *best)
+        assert words in sentence
+        assert sentence.endswith("leave one of them out")
+
+
+def test_an_evaluation_keeps_the_step_of_its_networks_and_its_report_takes_them_again(older_run, capsys):
+    import json
+
+    from reenact import report
+
+    command = ["evaluate", f"{older_run}", "--frames", "18"]
+    assert main([*command, "--checkpoint", "best"]) == 0
+    assert "older, of step 20: ball -> egg" in " ".join(capsys.readouterr().out.split())
+    assert json.loads((older_run / "evaluation" / "metrics.json").read_text())["checkpoint"] == 20
+    page = (older_run / "report.html").read_text()
+    assert "of step 20" in page
+    assert "--seed 0 --checkpoint 20" in page
+    assert report.main([f"{older_run}"]) == 0
+    assert (older_run / "report.html").read_text() == page
+    (older_run / "checkpoints" / "step-00000020.safetensors").unlink()
+    assert report.main([f"{older_run}"]) == 2
+    assert "got 20; there are those of steps 10, 30 (best)" in capsys.readouterr().err
+    assert main(command) == 0
+    assert "checkpoint" not in json.loads((older_run / "evaluation" / "metrics.json").read_text())

@@ -75,3 +75,15 @@ def test_a_clip_of_a_few_frames_goes_all_the_way(suffix, toy_run, tmp_path, caps
 def test_pairs_alone_copy_between_rigs_whose_shapes_look_alike(toy_run):
     weights = torch.rand(3, 7, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(ImageRetargeter.load(toy_run.folder).paired(weights), weights)
+
+
+def test_any_checkpoint_moves_a_clip_and_says_whether_it_is_the_newest(older_run):
+    moved, older = {}, {}
+    for which in ("newest", "best", "10", "20", "30"):
+        retargeter = ImageRetargeter.load(older_run, checkpoint=which)
+        moved[which], older[which] = retargeter.step(torch.zeros(7)), retargeter.older
+    assert older == {"newest": None, "best": 20, "10": 10, "20": 20, "30": None}
+    assert torch.equal(moved["best"], moved["20"])
+    assert torch.equal(moved["newest"], moved["30"])
+    assert float((moved["20"] - moved["10"]).abs().max()) > 0.1
+    assert float((moved["30"] - moved["20"]).abs().max()) > 0.1

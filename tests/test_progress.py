@@ -20,6 +20,13 @@ def run(toy_config, tmp_path) -> Run:
     return Run.create(replace(toy_config, run=str(tmp_path / "run"), training=training))
 
 
+def test_the_next_checkpoint_may_be_a_milestone_over_all_stages(toy_config, tmp_path):
+    training = replace(toy_config.training, together=False, milestones=14)
+    run = Run.create(replace(toy_config, run=str(tmp_path / "run"), training=training))
+    log(run, {"stage": "bpnet.ball", "step": 1, "loss": 1.0})
+    assert read_progress(run).next_checkpoint == 14
+
+
 def log(run: Run, *lines: dict) -> None:
     with (run.folder / "metrics.jsonl").open("a") as file:
         file.writelines(json.dumps(line) + "\n" for line in lines)
@@ -56,6 +63,13 @@ def test_steps_and_losses_are_counted_over_all_stages(run):
     assert (progress.state, progress.stage, progress.step, progress.done) == ("training", "bpnet.ball", 12, 24)
     assert progress.steps_per_second == pytest.approx(4.0)
     assert progress.seconds_left == pytest.approx(12 / 3)  # as many steps at 2 and at 6 a second: 1/2 s and 1/6 s each
+
+
+def test_the_held_out_error_is_a_curve_of_its_own(run):
+    log(run, {"stage": "reenactnet", "step": 3, "loss": 1.0, "held_out_own.egg": 0.3})
+    numbers = {"held_out": 0.5, "held_out.ball": 0.4, "held_out.egg": 0.6, "held_out_own.egg": 0.2}
+    log(run, {"stage": "reenactnet", "step": 6, "loss": 0.75, **numbers, "steps_per_second": 2.0})
+    assert read_progress(run).losses == {"loss": [(3, 1.0), (6, 0.75)], "held out": [(6, 0.5)]}
 
 
 def test_a_line_that_is_half_written_is_left_out(run):

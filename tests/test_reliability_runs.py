@@ -363,11 +363,11 @@ from pathlib import Path
 from lives import live, settings
 from reenact import training
 steps, seen, add = int(sys.argv[1]), [], training._Log.add
-def counted(log, step, losses):
+def counted(log, step, losses, **others):
     if step in (max(120, steps // 10), steps - 1):
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         seen.append(pages * resource.getpagesize())
-    add(log, step, losses)
+    add(log, step, losses, **others)
 training._Log.add = counted
 config = settings(Path(sys.argv[2]), 0, steps=steps, save_every=steps // 40, refresh=steps // 40)
 config = replace(config, bpnet=replace(config.bpnet, image_from=0.0))  # all kinds of work from the beginning

@@ -84,6 +84,7 @@ def make_run(folder, source, target, frames=36, methods=()):
     np.savez_compressed(folder / "evaluation" / "frames.npz", **arrays)
     (folder / "evaluation" / "metrics.json").write_text(json.dumps(evaluation.finite(numbers)))
     lines = [{"stage": "reenactnet", "step": 50 * i, "loss": 1 / (1 + i)} for i in range(1, 9)]
+    lines += [{"stage": "bpnet.b", "step": 20 * i, "loss": 0.5, "held_out": 0.8 / i} for i in range(1, 4)]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines) + '{"stage": "ree')
     (folder / "config.toml").write_text('source_clip = "synthetic:1"\n[images]\nresolution = 64\n')
     return forward, numbers
@@ -160,6 +161,8 @@ def test_the_page_has_player_sheets_curves_maps_and_training(page):
     assert tags.count("canvas") == 3  # source, reenacted, truth
     assert page.count("Weight of ") >= 4
     assert "Training loss of reenactnet" in page
+    assert "Held-out error of bpnet.b" in page
+    assert "Held-out error of reenactnet" not in page
     assert page.count("Error map: ") == 4
     assert page.count('class="sheet"') == 3  # worst frames, from bad to good, single shapes
 

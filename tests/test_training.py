@@ -152,6 +152,18 @@ def test_a_log_drops_the_lines_of_steps_that_are_taken_again(tmp_path):
     assert (added["stage"], added["step"], added["x"], added["loss"]) == ("b", 32, 3.0, 3.0)
 
 
+def test_what_a_killed_process_left_half_written_goes_when_the_run_goes_on_but_for_what_others_write(toy_run, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(toy_run.folder, folder)
+    names = [".metrics.jsonl.42.tmp", ".pairs.json.42.tmp", ".nudges.json.42.tmp"]
+    for name in names:
+        (folder / name).write_text("half")
+    config = replace(toy_run.config, run=str(folder))
+    with pytest.raises(KeyError):  # the checkpoint is of no training
+        train(config, resume=True)
+    assert [name for name in names if (folder / name).exists()] == [".nudges.json.42.tmp"]
+
+
 def test_epochs_over_a_fixed_set_become_steps():
     assert _step_count(7, None, 10, 4) == 7
     assert _step_count(7, 2.0, 10, 4) == 5

@@ -24,7 +24,7 @@ import torch
 from accessibility import nameless, poor_contrast, tab_stops
 from PIL import Image
 
-from reenact.checkpoint import newest_step, save_checkpoint
+from reenact.checkpoint import load_checkpoint, newest_step, save_checkpoint
 from reenact.errors import ReenactError
 from reenact.inference import ImageRetargeter
 from reenact.nudges import FORMAT, Nudge, Nudges, corrected, labels, load_nudges, save_nudges
@@ -251,6 +251,18 @@ def test_a_newer_checkpoint_takes_the_place_of_the_one_before(toy_config, tmp_pa
         assert session.describe()["run"]["checkpoint"] == step
         made_before = made if step == 5 else made_before
     assert float((made - made_before).abs().max()) > 0.01
+
+
+def test_a_checkpoint_that_was_chosen_stays_when_newer_ones_come(older_run):
+    session = Session.open([str(older_run)], "synthetic:1:1", checkpoint="best")
+    expected = ImageRetargeter.load(older_run, checkpoint="20")(session.clip).weights
+    assert torch.equal(torch.cat(list(session.track("egg", "networks"))), expected)
+    newest = load_checkpoint(older_run)
+    save_checkpoint(older_run, 40, newest.tensors, {}, error=0.1)
+    assert torch.equal(torch.cat(list(session.track("egg", "networks"))), expected)
+    assert session.describe()["run"] == {"folder": str(older_run), "checkpoint": 20, "chosen": True}
+    assert session.older == 20
+    assert Session.open([str(older_run)], "synthetic:1:1").older is None
 
 
 def test_an_animated_file_plays_what_it_holds(toy_pair, tmp_path):

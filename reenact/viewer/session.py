@@ -22,7 +22,7 @@ from PIL import Image
 from safetensors.numpy import save
 from torch import Tensor
 
-from reenact.checkpoint import newest_step
+from reenact.checkpoint import load_checkpoint, newest_step
 from reenact.errors import ReenactError
 from reenact.geometry import outward_faces
 from reenact.nudges import Nudges, load_nudges, parse_nudges, save_nudges
@@ -41,14 +41,15 @@ DEFAULT_CLIP = "synthetic:7:10"
 """Plays where no clip is given and no file holds one."""
 EXPORTS = {"csv": "text/csv", "glb": "model/gltf-binary", "json": "application/json", "npz": "application/octet-stream"}
 """Suffixes of `Session.export`, with what the web calls them."""
+TRAINED = ("networks", "pairs")
+"""Methods of a run, which ask for a checkpoint; a newer one replaces it while the page is open, unless one was
+chosen."""
 
 _MARKERS = 300
 """Pairs of places that correspondences are found at, as in `infer --method`."""
 _CHUNK = 256
 """Frames that are retargeted between two deliveries, where frames do not depend on each other."""
 _FRAME_BY_FRAME = ("networks", "pairs", "copy", "neutral")
-_TRAINED = ("networks", "pairs")
-"""Methods of a run, which ask for a checkpoint; a newer one replaces it while the page is open."""
 _STILL = 1e-6
 """Metres of an adult's face; what a shape moves less does not cross to the page."""
 _NEUTRAL_HEIGHT = 0.24
@@ -71,6 +72,7 @@ class Session:
         method: str | None = None,
         audio: Path | None = None,
         nudges_path: Path | None = None,
+        checkpoint: int | None = None,
     ) -> None:
         """
         Args:
@@ -83,6 +85,7 @@ class Session:
             method: Shown first on every target; the run's networks, or names, or shapes, unless said.
             audio: A .wav that plays along.
             nudges_path: Where corrections are kept, and read from if there are any.
+            checkpoint: Step of the run's networks; None follows the newest.
 
         Raises:
             ReenactError: An empty clip, an unknown method, or a file of nudges of other rigs.
@@ -95,6 +98,7 @@ class Session:
             )
         self.rigs, self.clip, self.clip_name = rigs, clip, clip_name
         self.files, self.run, self.audio, self.nudges_path = files or {}, run, audio, nudges_path
+        self.checkpoint = checkpoint
         self.source, *self.targets = rigs
         self._lock, self._made, self._trained_until = threading.RLock(), {}, None
         self._geometry_lock, self._geometry = threading.Lock(), {}
@@ -118,6 +122,7 @@ class Session:
         fps: float | None = None,
         source: str | None = None,
         target: str | None = None,
+        checkpoint: str = "newest",
     ) -> Session:
         """The session of a run folder, or of rigs by name or file.
 
@@ -130,6 +135,7 @@ class Session:
             fps: Frames per second to play at; the clip's unless said.
             source: Of a run of a cast, by any of its names; the first rig unless said.
             target: Another; the second unless said.
+            checkpoint: Of the run; see `load_checkpoint`. Any but the "newest" stays when others come.
 
         Raises:
             ReenactError: Nothing to show, or something of it cannot be read.
@@ -140,13 +146,16 @@ class Session:
         folders = [each for each in inputs if (Path(each) / "config.toml").is_file()]
         if folders and len(inputs) > 1:
             raise ReenactError(f"view: expected one run folder or some rigs, got {len(inputs)} with {folders[0]}")
-        run, files = None, {}
+        if checkpoint != "newest" and not folders:
+            raise ReenactError(f"view: expected a run beside --checkpoint, got {inputs[0]}; leave one of them out")
+        run, files, chosen = None, {}, None
         if folders:
             run = Run.open(folders[0])
             rigs = {key: run.rigs[key] for key in run.pair(source, target)}
             named = dict(zip(run.keys, run.config.rigs))
             origins = {key: named[key] for key in rigs}
             nudges = nudges or run.folder / "nudges.json"
+            chosen = None if checkpoint == "newest" else load_checkpoint(run.folder, checkpoint).step
         else:
             rigs, origins = {}, {}
             for name in inputs:
@@ -159,11 +168,19 @@ class Session:
             clip = str(files[first]) if first in files and _own_clip(files[first]) is not None else DEFAULT_CLIP
         played = load_clip(clip, rigs[first])
         played = played if fps is None else resampled(played, fps)
-        return cls(rigs, played, clip, files, run, method, audio, nudges)
+        return cls(rigs, played, clip, files, run, method, audio, nudges, chosen)
+
+    @property
+    def older(self) -> int | None:
+        """Step of the networks that were chosen, where they are not the newest."""
+        return None if self.run is None or self.checkpoint == newest_step(self.run.folder) else self.checkpoint
 
     def describe(self) -> dict[str, Any]:
         """What the page has to know before it asks for numbers."""
-        clip = self.clip
+        clip, run = self.clip, None
+        if self.run is not None:
+            run = {"folder": str(self.run.folder), "checkpoint": self.checkpoint or newest_step(self.run.folder)}
+            run |= {} if self.checkpoint is None else {"chosen": True}
         return {
             "clip": {"name": self.clip_name, "frames": len(clip), "fps": clip.fps},
             "source": self.source,
@@ -181,7 +198,7 @@ class Session:
                 }
                 for key, rig in self.rigs.items()
             ],
-            "run": self.run and {"folder": str(self.run.folder), "checkpoint": newest_step(self.run.folder)},
+            "run": run,
             "audio": self.audio is not None,
             "exports": list(EXPORTS),
             "kept": None if self.nudges_path is None else str(self.nudges_path),
@@ -260,7 +277,7 @@ class Session:
             raise ReenactError(f"{key}: expected a method that follows the source, got the animation of a file")
         with self._lock, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # which shapes have no partner is to be seen
-            if method in _TRAINED:
+            if method in TRAINED:
                 self._forget_older_networks()
             retarget = self._once((key, method), lambda: self._retargeter(key, method))
         size = _CHUNK if method in _FRAME_BY_FRAME else max(1, len(clip))
@@ -321,7 +338,7 @@ class Session:
         """What can move a target, the most useful first."""
         target, known = self.rigs[key], []
         if self.run is not None and key == self.targets[0]:
-            known += [each for each in _TRAINED if each != "pairs" or self.run.config.pairs.method != "none"]
+            known += [each for each in TRAINED if each != "pairs" or self.run.config.pairs.method != "none"]
         known += ["file"] if key in self.files and _own_clip(self.files[key]) is not None else []
         known += ["truth"] if self._true(target, torch.zeros(1, len(self.clip.names))) is not None else []
         return known + list(METHODS)
@@ -369,19 +386,23 @@ class Session:
         Raises:
             ReenactError: There is none yet.
         """
+        if self.checkpoint is not None:
+            return
         newest = newest_step(self.run.folder)
         if newest is None:
             due = read_progress(self.run).next_checkpoint
             raise ReenactError(f"{self.run.folder}: no checkpoint yet; the first is due at step {due:,}")
         if newest != self._trained_until:
-            self._made = {name: made for name, made in self._made.items() if name[-1] not in _TRAINED}
+            self._made = {name: made for name, made in self._made.items() if name[-1] not in TRAINED}
             self._trained_until = newest
 
     def _networks(self) -> Any:
         from reenact.inference import ImageRetargeter
 
         source, target = self.rigs
-        return self._once(("networks",), lambda: ImageRetargeter.load(self.run.folder, source=source, target=target))
+        which = "newest" if self.checkpoint is None else str(self.checkpoint)
+        named = {"source": source, "target": target, "checkpoint": which}
+        return self._once(("networks",), lambda: ImageRetargeter.load(self.run.folder, **named))
 
     def _once(self, name: tuple[str, ...], make: Callable[[], Any]) -> Any:
         """What was made under this name before, or now."""

@@ -9,8 +9,8 @@ const count = (number) => Math.round(number).toLocaleString("en");
 
 export class Training {
   /** `parts` are elements by name. `newer(step)` is told of another checkpoint, and says whether its networks are shown. */
-  constructor({ folder, checkpoint }, parts, style, newer) {
-    Object.assign(this, { folder, parts, style, newer });
+  constructor({ folder, checkpoint, chosen }, parts, style, newer) {
+    Object.assign(this, { folder, chosen, parts, style, newer }); // chosen: newer networks than these are not wanted
     this.shown = checkpoint; // whose networks move the faces
     this.progress = null;
     this.unfolded = false; // once, when there is something to see
@@ -32,8 +32,9 @@ export class Training {
       const { state, checkpoint } = this.progress;
       wait = EVERY[state];
       this.#tell();
-      if (checkpoint !== null && checkpoint !== this.shown && (await this.newer(checkpoint))) this.shown = checkpoint;
-      if (state === "finished" && checkpoint !== this.shown) wait = EVERY.stopped;
+      const wanted = checkpoint !== null && checkpoint !== this.shown && !this.chosen;
+      if (wanted && (await this.newer(checkpoint))) this.shown = checkpoint;
+      if (state === "finished" && checkpoint !== this.shown && !this.chosen) wait = EVERY.stopped;
       this.#tell();
     } catch (error) {
       this.parts.text.textContent = `How far the training is cannot be read: ${error.message}`;
