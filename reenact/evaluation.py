@@ -490,7 +490,7 @@ def evaluate(
         others[name] = METHODS[name](forward.source, forward.target, _correspondence(forward, name))
     numbers, arrays = evaluate_retargeters(forward, reverse, frames, seed, say, others)
     numbers = {"run": run_dir.resolve().name, **numbers}
-    if forward.older is not None:
+    if checkpoint != "newest" and forward.older is not None:
         numbers["checkpoint"] = forward.older
     folder = run_dir / "evaluation"
     folder.mkdir(parents=True, exist_ok=True)
