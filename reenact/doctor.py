@@ -258,11 +258,11 @@ def _space(folder: Path) -> Finding:
 
 def _locks(folder: Path) -> Finding:
     """Whether the system keeps two processes apart here; without it their signs of life do."""
-    from reenact.checkpoint import _lock
+    from reenact.lock import try_lock
 
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
-            _lock(file.fileno())
+            try_lock(file.fileno())
     except OSError as error:
         remedy = "runs are kept apart by signs of life instead, with a minute's delay after a crash"
         return Finding("locks", "missing", error.strerror or str(error), remedy, needed=False)

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from reenact.checkpoint import is_training, newest_step
+from reenact.checkpoint import newest_step
 from reenact.holdout import NUMBER, OWN
+from reenact.lock import is_training
 from reenact.run import Run
 from reenact.training import next_save, parsed_line, planned_steps
 

@@ -29,12 +29,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from reenact.checkpoint import Checkpoint, alive, load_checkpoint, load_tensors, save_tensors
+from reenact.checkpoint import Checkpoint, load_checkpoint, load_tensors, save_tensors
 from reenact.config import Config, PairsConfig, save_config
 from reenact.data import Studio
 from reenact.errors import ReenactError
 from reenact.folder import load_run_config, write_format
 from reenact.layout import find_layout, lay_out
+from reenact.lock import alive
 from reenact.models import Networks
 from reenact.nudges import Nudges, labels, load_nudges, save_nudges
 from reenact.pairs import Teacher, find_teacher

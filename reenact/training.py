@@ -14,13 +14,10 @@ on the next costs as much as the last.
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import os
 import shlex
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -38,7 +35,6 @@ from torch import Tensor
 from reenact import tensorboard
 from reenact.atomic import sweep, write_atomically
 from reenact.checkpoint import (
-    RunLock,
     best_checkpoint,
     flatten_optimizer,
     load_checkpoint,
@@ -48,9 +44,11 @@ from reenact.checkpoint import (
 )
 from reenact.config import Config, TrainingConfig
 from reenact.data import Studio, check_device, jitter
-from reenact.errors import ReenactError, interruptions
+from reenact.errors import ReenactError
 from reenact.folder import migrate
 from reenact.holdout import NUMBER, Holdout
+from reenact.interrupts import Interrupts, Output, listening
+from reenact.lock import RunLock
 from reenact.losses import VertexDistance, code_distance, weight_distance
 from reenact.models import Networks
 from reenact.pairs import LEAST_TRUST, Teacher
@@ -169,9 +167,9 @@ def train(config: Config, resume: bool = False) -> Path:
     if config.training.tensorboard:
         tensorboard.require()
     check_device(config.training.device)
-    with _interrupts() as interrupts, team() as workers:
+    with listening() as interrupts, team() as workers:
         # A folder may look like markup. Only the first process speaks.
-        console = Console(file=_Output(), markup=False, highlight=False, emoji=False, quiet=not workers.leads)
+        console = Console(file=Output(), markup=False, highlight=False, emoji=False, quiet=not workers.leads)
         # Already for the layout, which sums of several threads would end in other bits from time to time.
         torch.set_num_threads(config.training.threads or torch.get_num_threads())
         with console.status("Reading rigs, finding the layout"):
@@ -193,7 +191,7 @@ def train(config: Config, resume: bool = False) -> Path:
 
 
 def _train(
-    run: Run, resume: bool, lock: RunLock | None, interrupts: _Interrupts, console: Console, workers: Team
+    run: Run, resume: bool, lock: RunLock | None, interrupts: Interrupts, console: Console, workers: Team
 ) -> None:
     """The loop, for all stages that are left; interrupts end it at once until its first step, then after a save."""
     config = run.config
@@ -934,92 +932,6 @@ def _progress(console: Console) -> Iterator[Callable[[str, int, int, dict[str, f
             yield show
     else:
         yield show
-
-
-class _Interrupts:
-    """Ctrl-C, SIGTERM and a lost terminal: they end work at once, or ask for its end where work is patient."""
-
-    def __init__(self) -> None:
-        self.asked: BaseException | None = None
-        """What ends the training, once somebody has asked."""
-        self._patient = False
-
-    def hear(self, number: int, _frame: object) -> None:
-        """Handler of the signals; a second Ctrl-C stops at once, anything else that follows the first is ignored."""
-        if self.asked is not None:
-            if number == signal.SIGINT:
-                raise KeyboardInterrupt
-            return
-        self.asked = KeyboardInterrupt() if number == signal.SIGINT else SystemExit(128 + number)
-        if not self._patient:
-            raise self.asked
-
-    @contextmanager
-    def patiently(self) -> Iterator[None]:
-        """Work that must not be torn: it looks at `asked` by itself."""
-        before, self._patient = self._patient, True
-        try:
-            yield
-        finally:
-            self._patient = before
-
-    @contextmanager
-    def promptly(self) -> Iterator[None]:
-        """Work that can be dropped anywhere, inside patient work."""
-        before, self._patient = self._patient, False
-        try:
-            if self.asked is not None:
-                raise self.asked
-            with interruptions():
-                yield
-        finally:
-            self._patient = before
-
-
-@contextmanager
-def _interrupts() -> Iterator[_Interrupts]:
-    """Listens to signals for the length of a `with` block."""
-    interrupts, previous = _Interrupts(), {}
-    hangup = getattr(signal, "SIGHUP", None)  # Windows has none
-    for number in (signal.SIGINT, signal.SIGTERM, hangup):
-        if number is None or (number == hangup and signal.getsignal(number) == signal.SIG_IGN):  # nohup
-            continue
-        try:
-            previous[number] = signal.signal(number, interrupts.hear)
-        except ValueError:  # not the main thread: signals are somebody else's
-            break
-    try:
-        with interruptions():
-            yield interrupts
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
-class _Output:
-    """Standard output that falls silent, instead of failing, once nobody is there: a training outlives its terminal."""
-
-    def __init__(self) -> None:
-        self._stream = sys.stdout
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        self._try(self._stream.write, text)
-        return len(text)
-
-    def flush(self) -> None:
-        self._try(self._stream.flush)
-
-    def _try(self, call: Callable[..., object], *arguments: str) -> None:
-        try:
-            call(*arguments)
-        except OSError:
-            try:  # what is buffered must go somewhere, or Python complains when it ends
-                os.dup2(os.open(os.devnull, os.O_WRONLY), self._stream.fileno())
-            except OSError:
-                self._stream = io.StringIO()
 
 
 def _say_saved(console: Console, run: Run, stage: str, total: int, numbers: dict[str, float]) -> None:

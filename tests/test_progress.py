@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import pytest
 
-from reenact.checkpoint import RunLock, is_training, save_checkpoint
+from reenact.checkpoint import save_checkpoint
+from reenact.lock import RunLock, is_training
 from reenact.progress import read_progress
 from reenact.run import Run
 from reenact.training import planned_steps, train

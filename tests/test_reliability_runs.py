@@ -172,7 +172,7 @@ def test_runs_of_odd_names_train_and_resume(name, toy_config, tmp_path):
 
 def test_a_second_training_of_a_run_is_refused_and_names_the_first(tmp_path, capsys):
     shutil.copytree(STORED, tmp_path / "run")
-    code = "import sys, time\nfrom pathlib import Path\nfrom reenact.checkpoint import RunLock\n"
+    code = "import sys, time\nfrom pathlib import Path\nfrom reenact.lock import RunLock\n"
     code += "with RunLock(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
     first = subprocess.Popen(
         [sys.executable, "-c", code, tmp_path / "run"], stdout=subprocess.PIPE, text=True, cwd=HERE.parent
