@@ -21,6 +21,7 @@ from tyro.extras import subcommand_cli_from_dict
 from reenact.config import Config, PostConfig, changed_settings, check_config, load_config
 from reenact.errors import MissingError, ReenactError, interruptions
 from reenact.folder import check_run, load_run_config
+from reenact.tables import evaluation_tables, inspection_lines, of_step
 
 # PyTorch's threads wait for work by spinning, and would take the cores from the renderer's threads, which run between
 # its operations. OpenMP reads this once, when PyTorch loads it.
@@ -28,9 +29,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 # The rest of the project is imported inside the commands: PyTorch takes seconds to load, `--help` should not.
 if TYPE_CHECKING:
-    from rich.table import Table
-
-    from reenact.inspection import Inspection
     from reenact.rigs.clip import Clip
     from reenact.rigs.formats.pieces import Choice
     from reenact.rigs.rig import Rig
@@ -189,7 +187,7 @@ def infer(
         save_clip(moved, out, retargeter.target, names[1] if Path(names[1]).is_file() else None)
     print(
         f"{out}: {len(moved)} frames, {moved.duration:.1f} s, {retargeter.source.name} -> {retargeter.target.name}"
-        f"{_of_step(older)}"
+        f"{of_step(older)}"
     )
 
 
@@ -288,7 +286,7 @@ def evaluate(
                     checkpoint,
                 )
             )
-        for table in _tables(results[-1]):
+        for table in evaluation_tables(results[-1]):
             console.print(table)
     with console.status("Writing the report"):
         load = partial(ImageRetargeter.load, source=from_, target=to, checkpoint=checkpoint)
@@ -337,7 +335,7 @@ def view(
     with Console(stderr=True).status("Loading"):
         session = Session.open(inputs, clip, method, audio, nudges, fps, from_, to, checkpoint)
     if session.older is not None:
-        print(f"{inputs[0]}: networks{_of_step(session.older)}", flush=True)
+        print(f"{inputs[0]}: networks{of_step(session.older)}", flush=True)
     serve(session, port, browser)
 
 
@@ -387,7 +385,7 @@ def render(
         task = progress.add_task("Drawing", total=len(clip))
         save_video(played, out, size, opengl, audio, lambda done: progress.update(task, completed=done))
     names = ", ".join(each.rig.name for each in played)
-    print(f"{out}: {len(clip)} frames, {clip.duration:.1f} s, {names}{_of_step(played[-1].older)}")
+    print(f"{out}: {len(clip)} frames, {clip.duration:.1f} s, {names}{of_step(played[-1].older)}")
 
 
 def convert(
@@ -473,7 +471,7 @@ def inspect(
         rig, contents = read_rig(file, Choice(parts, shapes))
         facts = inspect(rig, contents)
     console = Console(markup=False, emoji=False, highlight=False)
-    for line in _facts(facts):
+    for line in inspection_lines(facts):
         console.print(line, soft_wrap=True)
     if json is not None:
         write_atomically(json, dumps(facts.to_dict(), indent=1, ensure_ascii=False).encode())
@@ -510,7 +508,9 @@ def rigs(
         console.print("\nTo see them: reenact rigs --out rigs.png", highlight=False)
         return
     with console.status("Drawing"):
-        _draw_rigs(list(BUILT_IN), size, out)
+        from reenact.rig_sheet import draw_rigs
+
+        draw_rigs(list(BUILT_IN), size, out)
     console.print(f"\nContact sheet: {out}", highlight=False, soft_wrap=True)
 
 
@@ -793,11 +793,6 @@ def _check_unchosen(command: str, checkpoint: str, what: str, given: str) -> Non
         raise ReenactError(f"{command}: expected {what} beside --checkpoint, got {given}; leave one of them out")
 
 
-def _of_step(older: int | None) -> str:
-    """Whose networks it was, where they are not the newest."""
-    return "" if older is None else f", of step {older:,}"
-
-
 def _infer_defaults(arguments: list[str]) -> PostConfig:
     """Where the post-processing of `infer` starts: as the run's settings say."""
     if arguments[:1] != ["infer"]:
@@ -867,52 +862,6 @@ def _plain(name: str) -> str:
     return "".join(each if each.isalnum() or each in "-_." else "-" for each in name)[:80] or "rig"
 
 
-def _facts(facts: Inspection) -> list[Any]:
-    """What was found in a rig, for the terminal."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    contents = facts.contents
-    width, height, depth = (100 * each for each in facts.size)
-    lines: list[Any] = [
-        f"{facts.name}: {contents.format}",
-        f"{facts.vertices} vertices, {facts.faces} faces, {len(facts.shapes)} blendshapes",
-        f"{width:.1f} cm wide, {height:.1f} cm tall, {depth:.1f} cm deep"
-        + (f"; {100 * facts.face:.1f} cm from eyes to mouth" if facts.face is not None else ""),
-    ]
-    lines += [f"parts: {', '.join(facts.parts)}"] if facts.parts else []
-    lines += [f"animation: {text}" for text in contents.animations]
-    lines += [f"texture: {text}" for text in contents.textures]
-    lines += [f"converted: {text}" for text in contents.converted]
-    meshes = Table(title="Meshes", title_justify="left")
-    for column in ("mesh", "vertices", "faces", "shapes", "in the rig"):
-        meshes.add_column(column, justify="left" if column in ("mesh", "in the rig") else "right")
-    for mesh in contents.meshes:
-        faces = str(mesh.faces) if mesh.faces else "-"
-        used = f"{'yes' if mesh.used else 'no'}, {mesh.reason}"
-        meshes.add_row(mesh.name, str(mesh.vertices), faces, str(mesh.shapes), used)
-    shapes = Table(
-        title="Shapes",
-        title_justify="left",
-        box=SIMPLE_HEAD,
-        pad_edge=False,
-        caption="strength: largest offset, 1 is the distance from eyes to mouth; moved: share of the vertices",
-        caption_justify="left",
-    )
-    shapes.add_column("shape", no_wrap=True)
-    shapes.add_column("ARKit", no_wrap=True)
-    for column in ("strength", "moved", "region", "side"):
-        shapes.add_column(column, justify="right" if column in ("strength", "moved") else "left")
-    for shape in facts.shapes:
-        known = "same" if shape.arkit == shape.name else shape.arkit or "-"
-        numbers = (f"{shape.strength:.3f}", f"{100 * shape.moved:.0f} %")
-        shapes.add_row(shape.name, known, *numbers, shape.region, shape.side)
-    lines += ["", meshes, shapes]
-    wrong = [*facts.problems, *(f"{shape.name} {text}" for shape in facts.shapes for text in shape.problems)]
-    lines += ["", f"Looks wrong ({len(wrong)}):" if wrong else "Nothing looks wrong"]
-    return [*lines, *(f"  {text}" for text in wrong)]
-
-
 def _check_out(path: Path, suffixes: tuple[str, ...]) -> None:
     """Refuse a file that cannot be written, before the work whose result it should hold."""
     if path.suffix.lower() not in suffixes:
@@ -923,99 +872,6 @@ def _check_out(path: Path, suffixes: tuple[str, ...]) -> None:
         raise ReenactError(f"{path}: expected a file to write, got a folder; name a file in it")
     if not path.parent.is_dir():
         raise MissingError(f"{path}: the folder {path.parent} does not exist; make it first")
-
-
-def _tables(numbers: dict[str, Any]) -> list[Table]:
-    """What one evaluation found, for the terminal."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    columns = {"this run": numbers, "direct": numbers["direct"]}
-    columns |= {"pairs": numbers["paired"]} if numbers["paired"] else {}
-    columns |= {name.replace("_", " "): row for name, row in numbers["baselines"].items()}
-    run = f"{numbers['run']}{_of_step(numbers.get('checkpoint'))}"
-    title = f"{run}: {numbers['source']} -> {numbers['target']}, {numbers['frames']} unseen frames"
-    caption = "direct: without ReenactNet" + "; pairs: of shapes, without any network" * bool(numbers["paired"])
-    look: dict[str, Any] = {"title_justify": "left", "box": SIMPLE_HEAD, "pad_edge": False}  # 80 columns hold them
-    compared = Table(title=title, caption=caption, caption_justify="left", **look)
-    compared.add_column("", no_wrap=True)
-    for name in columns:
-        compared.add_column(name, justify="right")
-    measures = {"truth": ("ver", "wmae", "correlation", "gain"), "cyclic": ("mae", "ssim", "mae_masked", "skill")}
-    for group, names in measures.items():
-        for name in names:
-            values = [(row[group] or {}).get(name) for row in columns.values()]
-            compared.add_row(f"{group}.{name}", *map(_number, values))
-    alone = Table(title="BPNet alone; speed", **look)
-    alone.add_column("", no_wrap=True)
-    alone.add_column("value", justify="right")
-    for group, names in {
-        "bpnet": ("wmae", "ver", "psnr", "ssim"),
-        "speed": ("fps", "latency_ms_p50", "latency_ms_p99"),
-    }.items():
-        for name in names:
-            alone.add_row(f"{group}.{name}", _number(numbers[group][name]))
-    if not numbers["methods"]:
-        return [compared, alone]
-    others = Table(title="Geometric methods, the same frames", **look)
-    others.add_column("", no_wrap=True)
-    for name in measures["truth"]:
-        others.add_column(f"truth.{name}", justify="right")
-    for method, row in numbers["methods"].items():
-        others.add_row(method, *(_number((row["truth"] or {}).get(name)) for name in measures["truth"]))
-    return [compared, others, alone]
-
-
-def _number(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
-
-
-_POSES: tuple[dict[str, float], ...] = (
-    {"mouthSmileLeft": 0.9, "mouthSmileRight": 0.9, "cheekSquintLeft": 0.6, "cheekSquintRight": 0.6, "jawOpen": 0.12},
-    {"browInnerUp": 0.9, "browOuterUpLeft": 0.8, "browOuterUpRight": 0.8, "eyeWideLeft": 0.9, "eyeWideRight": 0.9}
-    | {"jawOpen": 0.6},
-    {"eyeBlinkLeft": 1.0, "eyeBlinkRight": 1.0},
-    {"mouthPucker": 0.9, "browInnerUp": 0.3},
-    {"browDownLeft": 0.9, "browDownRight": 0.9, "noseSneerLeft": 0.7, "noseSneerRight": 0.7, "mouthFrownLeft": 0.4}
-    | {"mouthFrownRight": 0.4, "eyeSquintLeft": 0.4, "eyeSquintRight": 0.4},
-)
-"""Joy, surprise, a blink, a kiss, anger."""
-
-
-def _draw_rigs(names: list[str], size: int, out: Path) -> None:
-    """A row per rig: name, neutral, and a few poses; random expressions where the shapes have no ARKit meaning."""
-    import torch
-    from PIL import Image, ImageDraw, ImageFont
-
-    from reenact.portrait import Portrait
-    from reenact.rigs import arkit, motion
-    from reenact.rigs.files import load_rig
-
-    count, label = len(_POSES), max(16, size // 8)
-    sheet = Image.new("RGB", (size * (1 + count), (size + label) * len(names)), "white")
-    for row, name in enumerate(names):
-        rig = load_rig(name)
-        meanings = [arkit.meaning(shape) for shape in rig.names]
-        poses = torch.tensor(
-            [[max((pose.get(part, 0.0) for part in parts), default=0.0) for parts in meanings] for pose in _POSES]
-        )
-        if not poses.any():
-            poses = motion.expressions(rig.names, count, seed=4)
-        weights = torch.cat([torch.zeros(1, len(rig.names)), poses])
-        pictures = Portrait.of(rig).render(rig.vertices(weights), size)["color"]
-        top = row * (size + label)
-        ImageDraw.Draw(sheet).text(
-            (label // 3, top + label // 2),
-            f"{name}   {len(rig.names)} blendshapes",
-            fill="black",
-            anchor="lm",
-            font=ImageFont.load_default(0.7 * label),
-        )
-        for column, pixels in enumerate((pictures.clamp(0, 1) * 255).round().byte().permute(0, 2, 3, 1).numpy()):
-            sheet.paste(Image.fromarray(pixels), (column * size, top + label))
-    sheet.save(out)
 
 
 if __name__ == "__main__":

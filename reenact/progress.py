@@ -13,7 +13,8 @@ from reenact.checkpoint import newest_step
 from reenact.holdout import NUMBER, OWN
 from reenact.lock import is_training
 from reenact.run import Run
-from reenact.training import next_save, parsed_line, planned_steps
+from reenact.stages import planned_steps
+from reenact.training import next_save, parsed_line
 
 _POINTS = 300
 """Points of a curve at most; each is the mean of what lies around it."""

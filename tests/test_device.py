@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from reenact import training
+from reenact import stages
 from reenact.cli import main
 from reenact.data import Studio, check_device
 from reenact.errors import ReenactError
@@ -91,8 +91,8 @@ def test_what_a_training_computes_stays_on_its_device(network, together, elsewhe
         studios[key].neutral, studios[key].contrast = studio.neutral.to("meta"), studio.contrast.to("meta")
     distances = {key: VertexDistance(studio.rig, studio.typical, "meta") for key, studio in studios.items()}
     networks = run.networks().to("meta")
-    shop = training._Workshop(config, studios, networks, run.keys, partners, teachers, distances, Team())
-    for index, stage in enumerate(training._stages(shop)):
+    shop = stages.Workshop(config, studios, networks, run.keys, partners, teachers, distances, Team())
+    for index, stage in enumerate(stages.find_stages(shop)):
         pools = stage.render([0, index, 0])
         assert {pool.described.device.type for pool in pools.values()} == {"meta"}
         losses = stage.losses(pools, stage.draw(pools, torch.Generator().manual_seed(0)), 1.0)

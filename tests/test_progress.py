@@ -11,7 +11,8 @@ from reenact.checkpoint import save_checkpoint
 from reenact.lock import RunLock, is_training
 from reenact.progress import read_progress
 from reenact.run import Run
-from reenact.training import planned_steps, train
+from reenact.stages import planned_steps
+from reenact.training import train
 
 
 @pytest.fixture

@@ -25,8 +25,9 @@ from reenact.pairs import Pairs, Teacher
 from reenact.rigs.clip import Clip
 from reenact.rigs.motion import expressions
 from reenact.run import Run, networks_state
+from reenact.stages import _step_count
 from reenact.tensorboard import Board
-from reenact.training import _Log, _preview, _say_next, _step_count, learning_rate, train
+from reenact.training import _Log, _preview, _say_next, learning_rate, train
 
 
 def _trained(config, folder, **training):
