@@ -31,6 +31,7 @@ from typing import Any
 
 from reenact.atomic import write_atomically
 from reenact.config import read_table
+from reenact.data import check_device
 from reenact.errors import MissingError, ReenactError
 from reenact.folder import load_run_config
 from reenact.inference import ImageRetargeter
@@ -144,7 +145,7 @@ def _item(where: str, row: dict[str, Any]) -> Item:
 
 
 def run_batch(
-    manifest: Path, results: Path, say: Callable[[str], None] = lambda _: None
+    manifest: Path, results: Path, say: Callable[[str], None] = lambda _: None, device: str = "cpu"
 ) -> tuple[int, list[dict[str, Any]]]:
     """Move all clips of a manifest that are not done yet.
 
@@ -154,14 +155,16 @@ def run_batch(
         manifest: See `read_manifest`. Its paths are those of the folder where the command runs.
         results: The table, a .csv.
         say: Told of each item of this process that ended.
+        device: Where the networks of runs look at pictures.
 
     Returns:
         How many items failed, and the rows of the table in the order of the manifest.
 
     Raises:
-        ReenactError: The manifest is wrong, or the table is another file.
+        ReenactError: The manifest is wrong, the table is another file, or the device is not there.
         OSError: The table cannot be written.
     """
+    check_device(device)
     items = read_manifest(manifest)
     with team(timedelta(days=30)) as workers:
         if workers.leads:
@@ -173,7 +176,7 @@ def run_batch(
         todo = [number for number, item in enumerate(items) if item.digest not in done]
         for number in [todo[place] for place in workers.share(len(todo)).tolist()]:
             row = {"item": number + 1, "clip": items[number].clip, "out": items[number].out}
-            row |= _made(items[number], movers) | {"digest": items[number].digest}
+            row |= _made(items[number], movers, device) | {"digest": items[number].digest}
             _append(results, row)
             say(f"{row['out']}: {row['state']}" + f", {row['error']}" * bool(row["error"]))
         workers.wait()
@@ -185,7 +188,7 @@ def run_batch(
     return sum(row["state"] != "ok" for row in ordered), ordered
 
 
-def _made(item: Item, movers: OrderedDict[tuple, Any]) -> dict[str, Any]:
+def _made(item: Item, movers: OrderedDict[tuple, Any], device: str) -> dict[str, Any]:
     """What came of an item; nothing that goes wrong with it is raised."""
     started = time.perf_counter()
 
@@ -194,7 +197,7 @@ def _made(item: Item, movers: OrderedDict[tuple, Any]) -> dict[str, Any]:
         return {"state": state, "frames": frames, "seconds": seconds, "error": " ".join(error.split())}
 
     try:
-        return ended("ok", _move(item, movers))
+        return ended("ok", _move(item, movers, device))
     except ReenactError as error:
         return ended("failed", error=str(error))
     except OSError as error:
@@ -206,14 +209,14 @@ def _made(item: Item, movers: OrderedDict[tuple, Any]) -> dict[str, Any]:
         return ended("failed", error=f"a fault in Reenact, please report it: {type(error).__name__}: {error}")
 
 
-def _move(item: Item, movers: OrderedDict[tuple, Any]) -> int:
+def _move(item: Item, movers: OrderedDict[tuple, Any], device: str) -> int:
     """Write an item's clip; how many frames it has."""
     if not Path(item.out).parent.is_dir():
         raise MissingError(f"{item.out}: the folder {Path(item.out).parent} does not exist; make it first")
     if item.mover not in movers:
         while len(movers) >= _HELD:
             movers.popitem(last=False)
-        movers[item.mover] = _mover(item)
+        movers[item.mover] = _mover(item, device)
     movers.move_to_end(item.mover)
     retargeter, origin = movers[item.mover]
     moved = retargeter(load_clip(item.clip, retargeter.source))
@@ -224,10 +227,10 @@ def _move(item: Item, movers: OrderedDict[tuple, Any]) -> int:
     return len(moved)
 
 
-def _mover(item: Item) -> tuple[Any, str]:
+def _mover(item: Item, device: str) -> tuple[Any, str]:
     """What moves an item's clip, and where the target came from."""
     if item.run is not None:
-        named = {"source": item.source_in_run, "target": item.target_in_run}
+        named = {"source": item.source_in_run, "target": item.target_in_run, "device": device}
         found = ImageRetargeter.load(item.run, **named, checkpoint=item.checkpoint or "newest")
         origin = dict(zip(found.run.keys, found.run.config.rigs))[found.keys[1]]
         if item.method is None:

@@ -195,6 +195,7 @@ def batch(
     manifest: Annotated[Positional[Path], arg(metavar="MANIFEST")],
     *,
     results: Annotated[Path | None, arg(metavar="FILE.csv")] = None,
+    device: Literal["cpu", "cuda"] = "cpu",
 ) -> int:
     """Move many clips on many rigs, each as `reenact infer` would; results and failures go to one table.
 
@@ -206,12 +207,13 @@ def batch(
         manifest: Items as .csv, .json (a list) or .toml ([[item]]): clip and out; run, and from and to for a cast, or
             method, source and target; checkpoint, correspondence and fps where wanted.
         results: The table; MANIFEST-results.csv beside the manifest unless said.
+        device: Where the networks of runs look at pictures; cuda needs an NVIDIA GPU.
     """
     results = results or manifest.with_name(f"{manifest.stem}-results.csv")
     _check_out(results, (".csv",))
     from reenact.batch import run_batch
 
-    failed, rows = run_batch(manifest, results, lambda text: print(text, flush=True))
+    failed, rows = run_batch(manifest, results, lambda text: print(text, flush=True), device)
     print(f"{results}: {len(rows) - failed} of {len(rows)} ok, {failed} failed")
     return 3 if failed else 0
 
@@ -232,6 +234,7 @@ def evaluate(
     targets: Annotated[tuple[str, ...], arg(metavar="RIG")] = (),
     seeds: int = 3,
     checkpoint: Annotated[str, arg(metavar="newest|best|STEP")] = "newest",
+    device: Literal["cpu", "cuda"] = "cpu",
     take: Annotated[Path | None, arg(metavar="CLIP")] = None,
     results: Annotated[Path | None, arg(metavar="FILE.jsonl")] = None,
     keep: Annotated[Path | None, arg(metavar="FOLDER")] = None,
@@ -254,6 +257,7 @@ def evaluate(
         targets: Only these built-in characters; the word none leaves them out.
         seeds: How many seeds of clips and training the suite takes, from --seed on.
         checkpoint: Of each run: the newest, the best by the held-out error of its saves, or that of a step.
+        device: Where networks look at pictures; cuda needs an NVIDIA GPU.
         take: A recorded clip of ARKit shapes, measured as well.
         results: Finished cells of the suite: they are not made again, new ones are appended.
         keep: Keep the runs of the suite in this folder.
@@ -284,12 +288,13 @@ def evaluate(
                     from_,
                     to,
                     checkpoint,
+                    device,
                 )
             )
         for table in evaluation_tables(results[-1]):
             console.print(table)
     with console.status("Writing the report"):
-        load = partial(ImageRetargeter.load, source=from_, target=to, checkpoint=checkpoint)
+        load = partial(ImageRetargeter.load, source=from_, target=to, checkpoint=checkpoint, device=device)
         page = write_report(list(runs), results, load)
     console.print(f"Report: {page}", highlight=False, soft_wrap=True)
 
@@ -304,6 +309,7 @@ def view(
     from_: Annotated[str | None, arg(name="from", metavar="RIG")] = None,
     to: Annotated[str | None, arg(metavar="RIG")] = None,
     checkpoint: Annotated[str, arg(metavar="newest|best|STEP")] = "newest",
+    device: Literal["cpu", "cuda"] = "cpu",
     fps: float | None = None,
     port: int = 0,
     browser: bool = True,
@@ -323,6 +329,7 @@ def view(
         to: Another; the second unless said.
         checkpoint: Of the run: the newest, also while it trains; the best by the held-out error of its saves, or that
             of a step.
+        device: Where the run's networks look at pictures; cuda needs an NVIDIA GPU.
         fps: Frames per second to play at; those of the clip unless said.
         port: Of the page's address; any free one unless said.
         browser: Open the page.
@@ -333,7 +340,7 @@ def view(
     from reenact.viewer.session import Session
 
     with Console(stderr=True).status("Loading"):
-        session = Session.open(inputs, clip, method, audio, nudges, fps, from_, to, checkpoint)
+        session = Session.open(inputs, clip, method, audio, nudges, fps, from_, to, checkpoint, device)
     if session.older is not None:
         print(f"{inputs[0]}: networks{of_step(session.older)}", flush=True)
     serve(session, port, browser)
@@ -346,6 +353,7 @@ def render(
     rig: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="RIG", help_behavior_hint="(repeatable)")] = (),
     method: Annotated[str | None, arg(metavar="NAME")] = None,
     checkpoint: Annotated[str, arg(metavar="newest|best|STEP")] = "newest",
+    device: Literal["cpu", "cuda"] = "cpu",
     size: int = 512,
     fps: float | None = None,
     audio: Annotated[Path | None, arg(metavar="FILE.wav")] = None,
@@ -361,6 +369,7 @@ def render(
             unless said.
         method: Retarget from the first rig to the others instead; with a run, in place of its networks.
         checkpoint: Of the run: the newest, the best by the held-out error of its saves, or that of a step.
+        device: Where the run's networks look at pictures; cuda needs an NVIDIA GPU.
         size: Height and width of each rig in pixels.
         fps: Frames per second; those of the clip unless said.
         audio: Sound for the .mp4.
@@ -376,7 +385,7 @@ def render(
     check_out(out, audio)
     console = Console(stderr=True)
     with console.status("Loading"):
-        played = performances(inputs, rig, method, fps, checkpoint)
+        played = performances(inputs, rig, method, fps, checkpoint, device)
     if out.suffix.lower() == ".gif" and fps is None and played[0].clip.fps > GIF_RATE:
         print(f"{played[0].clip.fps:g} frames per second became 30: a .gif has at most {GIF_RATE}")
         played = [replace(each, clip=resampled(each.clip, 30.0)) for each in played]

@@ -446,6 +446,7 @@ def evaluate(
     source: str | None = None,
     target: str | None = None,
     checkpoint: str = "newest",
+    device: str = "cpu",
 ) -> dict:
     """The numbers of a finished run, also written to `RUN/evaluation/metrics.json`.
 
@@ -461,6 +462,7 @@ def evaluate(
         source: A rig of a cast, by any of its names; the run's first unless said.
         target: Another; the second unless said.
         checkpoint: The "newest", the "best", or a step; see `load_checkpoint`.
+        device: Where pictures are rendered and networks run; what they say is compared on the CPU.
 
     Returns:
         See `evaluate_retargeters`, and `run`, the folder's name; `checkpoint`, the step of the networks where they are
@@ -482,6 +484,7 @@ def evaluate(
     say("loading the networks")
     named = {name: value for name, value in (("source", source), ("target", target)) if value is not None}
     named |= {} if checkpoint == "newest" else {"checkpoint": checkpoint}
+    named |= {} if device == "cpu" else {"device": device}
     forward = ImageRetargeter.load(run_dir, **named)
     reverse = ImageRetargeter.load(run_dir, reverse=True, **named)
     others = {}

@@ -27,7 +27,10 @@ _CHUNK = 64
 
 
 class ImageRetargeter:
-    """Moves motion from `source` to `target` through a shared picture space."""
+    """Moves motion from `source` to `target` through a shared picture space.
+
+    Weights and pictures come from and go to the CPU, wherever networks and renderer work.
+    """
 
     def __init__(
         self,
@@ -105,37 +108,37 @@ class ImageRetargeter:
 
     def source_pictures(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N C R R"]:
         """The source as the networks see it, before its neutral is subtracted: colours, then the motion pass."""
-        return self.source_studio.photograph(weights)
+        return self.source_studio.photograph(weights).cpu()
 
     def target_pictures(self, weights: Float[Tensor, "N Kt"]) -> Float[Tensor, "N C R R"]:
         """The target in the shared layout: colours, then the motion pass."""
-        return self.target_studio.photograph(weights)
+        return self.target_studio.photograph(weights).cpu()
 
     def source_masks(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N 1 R R"]:
         """Coverage of the source's pictures."""
-        return self.source_studio.photograph(weights, ("mask",))
+        return self.source_studio.photograph(weights, ("mask",)).cpu()
 
     def target_masks(self, weights: Float[Tensor, "N Kt"]) -> Float[Tensor, "N 1 R R"]:
         """Coverage of the target's pictures in the shared layout."""
-        return self.target_studio.photograph(weights, ("mask",))
+        return self.target_studio.photograph(weights, ("mask",)).cpu()
 
     @torch.inference_mode()
     def reenact(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N C R R"]:
         """Pictures of the source redrawn as the target, in the shared layout, colours in [0, 1]."""
         shown = self.source_studio.show(pictures.to(self.source_studio.device))
-        return self.target_studio.picture(self.networks.redraw(shown, *self.keys))
+        return self.target_studio.picture(self.networks.redraw(shown, *self.keys)).cpu()
 
     @torch.inference_mode()
     def read(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N Kt"]:
         """Weights of the target that make the pictures, clamped to [0, 1]."""
         shown = self.target_studio.show(pictures.to(self.target_studio.device))
-        return self.networks.read(shown, self.keys[1]).clamp(0, 1)
+        return self.networks.read(shown, self.keys[1]).clamp(0, 1).cpu()
 
     @torch.inference_mode()
     def read_direct(self, pictures: Float[Tensor, "N C R R"]) -> Float[Tensor, "N Kt"]:
         """Weights read from the source's own pictures by the target's BPNet: what ReenactNet has to beat."""
         shown = self.source_studio.show(pictures.to(self.source_studio.device))
-        return self.networks.read(shown, self.keys[1]).clamp(0, 1)
+        return self.networks.read(shown, self.keys[1]).clamp(0, 1).cpu()
 
     @torch.inference_mode()
     def paired(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"] | None:

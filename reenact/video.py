@@ -55,6 +55,7 @@ def performances(
     method: str | None = None,
     fps: float | None = None,
     checkpoint: str = "newest",
+    device: str = "cpu",
 ) -> list[Performance]:
     """Who plays what, frame by frame together.
 
@@ -65,6 +66,7 @@ def performances(
         method: Retargets the clip from the first rig to the others instead; of a run, what takes the networks' place.
         fps: Frames per second; the clip's unless said.
         checkpoint: Of the run; see `load_checkpoint`.
+        device: Where the run's networks look at pictures.
 
     Raises:
         ReenactError: Something is missing, too much, or cannot be read.
@@ -82,7 +84,7 @@ def performances(
         )
     if is_run:
         clip = inputs[1] if len(inputs) == 2 else DEFAULT_CLIP
-        return _played(Session.open([inputs[0]], clip, method, fps=fps, checkpoint=checkpoint))
+        return _played(Session.open([inputs[0]], clip, method, fps=fps, checkpoint=checkpoint, device=device))
     clip = inputs[0]
     names = list(rigs) or [clip]
     if method is not None:

@@ -62,7 +62,7 @@ def test_what_is_done_is_not_made_again_and_what_failed_is_tried_again(rows, tmp
     manifest, results = _manifest(tmp_path, rows), tmp_path / "results.csv"
     asked = []
     move = batch._move
-    monkeypatch.setattr(batch, "_move", lambda item, movers: asked.append(item.out[-5:]) or move(item, movers))
+    monkeypatch.setattr(batch, "_move", lambda item, *others: asked.append(item.out[-5:]) or move(item, *others))
     assert run_batch(manifest, results)[0] == 2
     with open(results, "a") as file:
         file.write('5,"torn by a power c')
@@ -77,7 +77,7 @@ def test_what_is_done_is_not_made_again_and_what_failed_is_tried_again(rows, tmp
 
 
 def test_a_fault_of_ours_is_a_row_too(rows, tmp_path, monkeypatch, capsys):
-    def broken(item, movers):
+    def broken(*_):
         raise ZeroDivisionError("x / 0")
 
     monkeypatch.setattr(batch, "_move", broken)

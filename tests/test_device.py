@@ -49,7 +49,7 @@ def elsewhere(monkeypatch):
     def photograph(self, weights, buffers=None):
         place = self.portrait.rig.neutral.device
         vertices = self.portrait.rig.vertices(weights.to(self.device))
-        channels = 3 * len(buffers or self.buffers)
+        channels = sum(1 if name == "mask" else 3 for name in buffers or self.buffers)
         return vertices.mean((1, 2)).view(-1, 1, 1, 1).expand(-1, channels, self.resolution, self.resolution).to(place)
 
     original = Studio.photograph
@@ -100,12 +100,34 @@ def test_what_a_training_computes_stays_on_its_device(network, together, elsewhe
         torch.stack(list(losses.values())).sum().backward()
 
 
-def test_pictures_are_taken_to_the_networks(elsewhere, toy_run):
+@pytest.fixture
+def brought(monkeypatch):
+    """What comes to the CPU from the device without numbers becomes zeros, where PyTorch would refuse."""
+    bring = torch.Tensor.cpu
+    monkeypatch.setattr(
+        torch.Tensor,
+        "cpu",
+        lambda self: torch.zeros(self.shape, dtype=self.dtype) if self.device.type == "meta" else bring(self),
+    )
+
+
+def test_pictures_are_taken_to_the_networks_and_brought_back(elsewhere, brought, toy_run):
     moving = ImageRetargeter.load(toy_run.folder)
     for studio in (moving.source_studio, moving.target_studio):
         studio.device, studio.portrait = "meta", _far(studio.portrait)
         studio.neutral, studio.contrast = studio.neutral.to("meta"), studio.contrast.to("meta")
     moving.networks.to("meta")
     pictures = torch.rand(2, 6, 32, 32)
-    assert moving.reenact(pictures).device.type == "meta"
-    assert moving.read(pictures).device.type == moving.read_direct(pictures).device.type == "meta"
+    for look in (moving.reenact, moving.read, moving.read_direct):
+        assert look(pictures).device.type == "cpu"
+    for look in (moving.source_pictures, moving.target_pictures, moving.source_masks, moving.target_masks):
+        assert look(torch.rand(2, len(moving.source.names))).device.type == "cpu"
+
+
+@pytest.mark.parametrize("command", ["evaluate RUN", "view RUN", "render RUN --out x.mp4", "batch MANIFEST"])
+@LACKING
+def test_every_command_that_runs_networks_takes_a_device(command, toy_run, tmp_path, capsys):
+    (tmp_path / "m.csv").write_text(f"run,clip,out\n{toy_run.folder},synthetic:1:1,{tmp_path / 'x.csv'}\n")
+    places = {"RUN": f"{toy_run.folder}", "MANIFEST": f"{tmp_path / 'm.csv'}", "x.mp4": f"{tmp_path / 'x.mp4'}"}
+    assert main([*(places.get(word, word) for word in command.split()), "--device", "cuda"]) == 2
+    assert "expected an NVIDIA GPU" in capsys.readouterr().err

@@ -23,6 +23,7 @@ from safetensors.numpy import save
 from torch import Tensor
 
 from reenact.checkpoint import load_checkpoint, newest_step
+from reenact.data import check_device
 from reenact.errors import ReenactError
 from reenact.geometry import outward_faces
 from reenact.nudges import Nudges, load_nudges, parse_nudges, save_nudges
@@ -73,6 +74,7 @@ class Session:
         audio: Path | None = None,
         nudges_path: Path | None = None,
         checkpoint: int | None = None,
+        device: str = "cpu",
     ) -> None:
         """
         Args:
@@ -86,6 +88,7 @@ class Session:
             audio: A .wav that plays along.
             nudges_path: Where corrections are kept, and read from if there are any.
             checkpoint: Step of the run's networks; None follows the newest.
+            device: Where they look at pictures.
 
         Raises:
             ReenactError: An empty clip, an unknown method, or a file of nudges of other rigs.
@@ -98,7 +101,7 @@ class Session:
             )
         self.rigs, self.clip, self.clip_name = rigs, clip, clip_name
         self.files, self.run, self.audio, self.nudges_path = files or {}, run, audio, nudges_path
-        self.checkpoint = checkpoint
+        self.checkpoint, self.device = checkpoint, device
         self.source, *self.targets = rigs
         self._lock, self._made, self._trained_until = threading.RLock(), {}, None
         self._geometry_lock, self._geometry = threading.Lock(), {}
@@ -123,6 +126,7 @@ class Session:
         source: str | None = None,
         target: str | None = None,
         checkpoint: str = "newest",
+        device: str = "cpu",
     ) -> Session:
         """The session of a run folder, or of rigs by name or file.
 
@@ -136,13 +140,15 @@ class Session:
             source: Of a run of a cast, by any of its names; the first rig unless said.
             target: Another; the second unless said.
             checkpoint: Of the run; see `load_checkpoint`. Any but the "newest" stays when others come.
+            device: As in the constructor.
 
         Raises:
-            ReenactError: Nothing to show, or something of it cannot be read.
+            ReenactError: Nothing to show, something of it cannot be read, or the device is not there.
             FileNotFoundError: As `Run.open`.
         """
         if not inputs:
             raise ReenactError("view: expected a run folder, or rigs by name or file, got nothing to show")
+        check_device(device)
         folders = [each for each in inputs if (Path(each) / "config.toml").is_file()]
         if folders and len(inputs) > 1:
             raise ReenactError(f"view: expected one run folder or some rigs, got {len(inputs)} with {folders[0]}")
@@ -168,7 +174,7 @@ class Session:
             clip = str(files[first]) if first in files and _own_clip(files[first]) is not None else DEFAULT_CLIP
         played = load_clip(clip, rigs[first])
         played = played if fps is None else resampled(played, fps)
-        return cls(rigs, played, clip, files, run, method, audio, nudges, chosen)
+        return cls(rigs, played, clip, files, run, method, audio, nudges, chosen, device)
 
     @property
     def older(self) -> int | None:
@@ -401,7 +407,7 @@ class Session:
 
         source, target = self.rigs
         which = "newest" if self.checkpoint is None else str(self.checkpoint)
-        named = {"source": source, "target": target, "checkpoint": which}
+        named = {"source": source, "target": target, "checkpoint": which, "device": self.device}
         return self._once(("networks",), lambda: ImageRetargeter.load(self.run.folder, **named))
 
     def _once(self, name: tuple[str, ...], make: Callable[[], Any]) -> Any:
