@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from reenact.errors import ReenactError
 from reenact.retargeting.anatomical_transfer import AnatomicalTransfer
 from reenact.retargeting.anatomy import JAW, SKULL, build_shell, carry_shell, default_thickness, prisms
-from reenact.retargeting.contact import interpenetration
+from reenact.retargeting.contact import Side, interpenetration
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import DeformationTransfer
 from reenact.retargeting.landmarks import Landmarks
@@ -28,6 +28,7 @@ from reenact.retargeting.tetrahedra import (
     volume_gradient,
 )
 from reenact.rigs.files import load_rig
+from reenact.rigs.rig import Rig
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +193,26 @@ def test_skin_in_skin_is_seen_and_taken_out(toon, shell, physics):
     assert float(after) < 0.003 * shell.height
     free = FacePhysics(shell, PhysicsConfig(contact=0.0))
     assert float(interpenetration(shell, free(mesh))["lips"]) > float(after)
+
+
+def test_behind_skin_is_not_in_it():
+    """As the inner side of a lip in a mouth wide open; only where a sheet passes through the other is it inside."""
+    places = np.stack(np.meshgrid(np.arange(9.0), np.arange(9.0), indexing="ij"), -1).reshape(81, 2) - 4
+    corner = (9 * np.arange(8)[:, None] + np.arange(8)).ravel()
+    up = np.concatenate([corner[:, None] + [0, 9, 10], corner[:, None] + [0, 10, 1]])
+    small = 0.3 * places + [0.05, 0.02]  # no vertex above a fold
+
+    def depths(heights):
+        points = np.concatenate([np.column_stack([places, np.zeros(81)]), np.column_stack([small, heights])])
+        faces = torch.from_numpy(np.concatenate([up, 81 + up[:, ::-1]]))
+        rig = Rig("sheets", torch.from_numpy(points).float(), torch.zeros(1, 162, 3), ("still",), faces)
+        sheet = [Side.of(rig, np.flatnonzero(np.abs(places).max(1) < 4) + first) for first in (0, 81)]
+        return sheet[1].depths(points, sheet[0], limit=1.0), sheet[1].vertices - 81
+
+    assert not depths(np.full(81, -0.4))[0].any()
+    tilted = 0.2 * small[:, 0]
+    found, members = depths(tilted)
+    np.testing.assert_allclose(found, (-tilted[members]).clip(0), atol=1e-6)  # float32 at rest
 
 
 def test_a_face_at_rest_stays_and_bones_hold(toon, shell, physics):

@@ -331,10 +331,8 @@ class FacePhysics:
             state[self._free] += missing * whole / (slopes * direction).sum() * direction
 
     def _posed(self, mesh: ndarray, state: ndarray, skin: ndarray) -> Float[ndarray, "V 3"]:
-        """The mesh of the rig with its skin where the nodes are."""
-        posed = mesh.copy()
-        posed[self.shell.vertices.numpy()] += state[: len(skin)] - skin
-        return posed
+        """The mesh of the rig with its skin where the nodes are, and what hangs on it moved along."""
+        return mesh + self.shell.rest.matrix @ (state[: len(skin)] - skin)
 
     def _pushes(self, mesh: Float[ndarray, "V 3"]) -> Float[ndarray, "N 3"]:
         """Offsets of skin nodes that take lips, lids and teeth out of each other; both sides give way, teeth do not."""
