@@ -225,6 +225,20 @@ def test_a_face_at_rest_stays_and_bones_hold(toon, shell, physics):
     )
 
 
+def test_skin_yields_where_its_target_is_not_trusted(toon, shell):
+    spike = toon.neutral[None].clone()
+    place = shell.vertices[int(np.argmin(np.abs(shell.thickness - np.median(shell.thickness))))]
+    spike[0, place, 2] += 0.05 * shell.height
+    config, left = PhysicsConfig(skin=400.0, contact=0.0, whole=1.0), {}
+    for trust in (1.0, 0.02):
+        trusted = torch.ones(len(toon.neutral))
+        trusted[place] = trust
+        left[trust] = float((FacePhysics(shell, config, trust=trusted)(spike) - toon.neutral)[0, place].norm())
+    assert left[0.02] < 0.5 * left[1.0]
+    with pytest.raises(ReenactError, match="expected a positive trust for each"):
+        FacePhysics(shell, trust=torch.zeros(len(toon.neutral)))
+
+
 def test_volume_is_kept_where_skin_is_pressed_in(toon, shell):
     cheek = toon.neutral[torch.from_numpy(shell.landmarks.face.vertices)]
     place = torch.tensor([0.6 * float(shell.landmarks.eyes[0, 0]), 0.5 * float(shell.landmarks.mouth[1]) + 0.01])
