@@ -236,9 +236,8 @@ def measure(trial: Trial, counts: list[int], draws: list[int], say: Callable[[st
                 if draw > 0 and row not in ("AnaConDaR", "without physics"):
                     continue
                 config = replace(AnacondarConfig(), **switches)
-                method = Anacondar(
-                    trial.source, trial.target, dense, config=config, examples=examples, counterparts=counterparts
-                )
+                given = {"examples": examples, "counterparts": counterparts, "shell": trial.shell}
+                method = Anacondar(trial.source, trial.target, dense, config=config, **given)
                 start = time.thread_time()
                 vertices = torch.cat([method.stages(part).vertices for part in trial.frames.split(16)])
                 seconds = (time.thread_time() - start) / len(vertices)

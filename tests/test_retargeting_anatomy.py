@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from reenact.errors import ReenactError
 from reenact.retargeting.anatomical_transfer import AnatomicalTransfer
 from reenact.retargeting.anatomy import JAW, SKULL, build_shell, carry_shell, default_thickness, prisms
-from reenact.retargeting.contact import interpenetration
+from reenact.retargeting.contact import Side, interpenetration
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import DeformationTransfer
 from reenact.retargeting.landmarks import Landmarks
@@ -28,6 +28,7 @@ from reenact.retargeting.tetrahedra import (
     volume_gradient,
 )
 from reenact.rigs.files import load_rig
+from reenact.rigs.rig import Rig
 
 
 @pytest.fixture(scope="module")
@@ -194,6 +195,26 @@ def test_skin_in_skin_is_seen_and_taken_out(toon, shell, physics):
     assert float(interpenetration(shell, free(mesh))["lips"]) > float(after)
 
 
+def test_behind_skin_is_not_in_it():
+    """As the inner side of a lip in a mouth wide open; only where a sheet passes through the other is it inside."""
+    places = np.stack(np.meshgrid(np.arange(9.0), np.arange(9.0), indexing="ij"), -1).reshape(81, 2) - 4
+    corner = (9 * np.arange(8)[:, None] + np.arange(8)).ravel()
+    up = np.concatenate([corner[:, None] + [0, 9, 10], corner[:, None] + [0, 10, 1]])
+    small = 0.3 * places + [0.05, 0.02]  # no vertex above a fold
+
+    def depths(heights):
+        points = np.concatenate([np.column_stack([places, np.zeros(81)]), np.column_stack([small, heights])])
+        faces = torch.from_numpy(np.concatenate([up, 81 + up[:, ::-1]]))
+        rig = Rig("sheets", torch.from_numpy(points).float(), torch.zeros(1, 162, 3), ("still",), faces)
+        sheet = [Side.of(rig, np.flatnonzero(np.abs(places).max(1) < 4) + first) for first in (0, 81)]
+        return sheet[1].depths(points, sheet[0], limit=1.0), sheet[1].vertices - 81
+
+    assert not depths(np.full(81, -0.4))[0].any()
+    tilted = 0.2 * small[:, 0]
+    found, members = depths(tilted)
+    np.testing.assert_allclose(found, (-tilted[members]).clip(0), atol=1e-6)  # float32 at rest
+
+
 def test_a_face_at_rest_stays_and_bones_hold(toon, shell, physics):
     still = physics(toon.neutral[None])
     assert float((still - toon.neutral).norm(dim=-1).max()) < 1e-3 * shell.height
@@ -202,6 +223,20 @@ def test_a_face_at_rest_stays_and_bones_hold(toon, shell, physics):
     torch.testing.assert_close(
         torch.pdist(states[0, jaw][::40]), torch.pdist(shell.nodes[jaw][::40]), rtol=0, atol=1e-9
     )
+
+
+def test_skin_yields_where_its_target_is_not_trusted(toon, shell):
+    spike = toon.neutral[None].clone()
+    place = shell.vertices[int(np.argmin(np.abs(shell.thickness - np.median(shell.thickness))))]
+    spike[0, place, 2] += 0.05 * shell.height
+    config, left = PhysicsConfig(skin=400.0, contact=0.0, whole=1.0), {}
+    for trust in (1.0, 0.02):
+        trusted = torch.ones(len(toon.neutral))
+        trusted[place] = trust
+        left[trust] = float((FacePhysics(shell, config, trust=trusted)(spike) - toon.neutral)[0, place].norm())
+    assert left[0.02] < 0.5 * left[1.0]
+    with pytest.raises(ReenactError, match="expected a positive trust for each"):
+        FacePhysics(shell, trust=torch.zeros(len(toon.neutral)))
 
 
 def test_volume_is_kept_where_skin_is_pressed_in(toon, shell):

@@ -20,6 +20,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -31,6 +32,7 @@ from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import DeformationTransfer, densify
 from reenact.retargeting.examples import choose, embed
 from reenact.retargeting.inverse_rig import InverseRig
+from reenact.retargeting.landmarks import smoothed, smoothing_matrix
 from reenact.retargeting.physics import FacePhysics, PhysicsConfig, features
 from reenact.retargeting.plbs import PatchConfig, PatchwiseBlendshapes, check_examples
 from reenact.retargeting.retargeter import check_names
@@ -40,6 +42,7 @@ from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
 _CHUNK = 32  # frames at a time: bounds memory, not results
+_LEAST_TRUST = 1 / 64  # of the skin's hold, where pairs are unsure
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,10 @@ class AnacondarConfig:
     characteristics: Literal["source", "target"] = "source"
     """Whose slits, widths and contours the simulation keeps: those of the source's frame, in the target's size, or what
     examples and transfer have made of them. The latter also where the source's cannot be told, see `_trusted`."""
+
+    doubt: float = 4.0
+    """Power of the pairs' confidence by which the simulation holds the skin less to its target, down to a 64th: where
+    pairs are unsure, its target is noise more often. 0 holds it everywhere alike."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +143,8 @@ class Anacondar:
             self.transfer = DeformationTransfer(source, target, dense)
         self.physics = None
         if self.config.physics is not None:
-            self.physics = FacePhysics(self.shell, self.config.physics, stiffness=stiffness)
+            trust = _confidence(self.shell, dense).pow(self.config.doubt).clamp_min(_LEAST_TRUST)
+            self.physics = FacePhysics(self.shell, self.config.physics, stiffness=stiffness, trust=trust)
             anatomical = isinstance(self.transfer, AnatomicalTransfer)
             self.source_shell = self.transfer.source_shell if anatomical else carry_shell(self.shell, source, dense)
             """The same tissue in the source."""
@@ -219,6 +227,23 @@ def _trusted(source: Shell, target: Shell) -> Bool[Tensor, "C"]:
         parts = [features(shell, part).norm(dim=-1).amax(0) for part in shapes.split(_CHUNK)]
         ranges.append(torch.stack(parts).amax(0))
     return (ranges[0] > 0.4 * ranges[1]) & (ranges[0] < 2.5 * ranges[1])
+
+
+def _confidence(shell: Shell, pairs: Correspondence, steps: int = 8) -> Float[Tensor, "V"]:
+    """How sure the pairs around each vertex of the target are, 0 to 1; 1 outside the tissue and far from any pair.
+
+    Both the confidences and how many there are spread over the skin for some steps.
+    """
+    corners, shares = pairs.target.corners.ravel().numpy(), pairs.target.shares.double().ravel().numpy()
+    weighed = shares * pairs.confidence.double().repeat_interleave(3).numpy()
+    numbers, size = shell.vertices.numpy(), len(shell.rig.neutral)
+    smoother = smoothing_matrix(shell.skin_faces, len(shell))
+    sums, counts = (
+        smoothed(smoother, np.bincount(corners, values, size)[numbers], steps) for values in (weighed, shares)
+    )
+    confidence = torch.ones(size, dtype=torch.float64)
+    confidence[shell.vertices] = torch.from_numpy(np.where(counts > 1e-6, sums / np.maximum(counts, 1e-6), 1.0))
+    return confidence.clamp(0, 1)
 
 
 def _meshes(rig: Rig, expressions: Tensor) -> Float[Tensor, "E V 3"]:

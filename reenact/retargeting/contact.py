@@ -6,15 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from reenact.geometry import (
     closest_points,
+    mesh_edges,
     vertex_normals,
 )
 from reenact.retargeting.anatomy import Shell, unit_vectors
+from reenact.retargeting.tetrahedra import first_hits
 from reenact.rigs.head import boundary_edges
 from reenact.rigs.rig import Rig
 
@@ -26,8 +30,9 @@ def interpenetration(shell: Shell, vertices: Float[Tensor, "T V 3"]) -> dict[str
     """How deep the two sides of each contact lie in each other, metres; 0 where they do not.
 
     A vertex of one side is inside the other where the closest point of that side's skin faces away from it, within 60
-    degrees of straight, and is no border of it. Its depth is the distance to that point. Where
-    sides already lie in each other at rest, as lips do in some sculpted neutrals, that depth counts too.
+    degrees of straight, and is no border of it; and where an edge from it, or from those inside beside it, to the
+    outside passes through that skin. Its depth is the distance to that point. Where sides already lie in each other at
+    rest, as lips do in some sculpted neutrals, that depth counts too.
     """
     shell._check(vertices)
     depths = {}
@@ -55,6 +60,8 @@ class Side:
     """Of `vertices` in `number`."""
     edge: ndarray
     """Which of `number` are on the border of the faces."""
+    ends: ndarray
+    """(E, 2) edges that a vertex of the side is an end of, as places in `number`."""
 
     @classmethod
     def of(cls, rig: Rig, vertices: Int[ndarray, "U"]) -> Side:
@@ -65,7 +72,9 @@ class Side:
         number, local = np.unique(near, return_inverse=True)
         local = local.reshape(-1, 3)
         edge = np.isin(np.arange(len(number)), boundary_edges(local))
-        return cls(vertices, number, local, np.searchsorted(number, vertices), edge)
+        ends = mesh_edges(local)
+        ends = ends[member[number][ends].any(1)]
+        return cls(vertices, number, local, np.searchsorted(number, vertices), edge, ends)
 
     def depths(self, mesh: ndarray, other: Side, limit: float) -> Float[ndarray, "U"]:
         """How deep this side's vertices are inside the other."""
@@ -101,10 +110,37 @@ class Side:
         flat = np.cross(
             surface[corners[:, 1]] - surface[corners[:, 0]], surface[corners[:, 2]] - surface[corners[:, 0]]
         )
-        # The way out of flesh runs along the normal; a way across it leads around an edge.
-        behind = ((away * normal).sum(1) < -0.5 * distance) & ((away * flat).sum(1) < 0)
+        # The way out of flesh runs along the normal; a way across it leads around an edge. On a fold which of two faces
+        # was found is a matter of rounding, and its own normal tells nothing.
+        fold = shares.min(1) < 1e-6
+        behind = ((away * normal).sum(1) < -0.5 * distance) & (fold | ((away * flat).sum(1) < 0))
         inside = behind & ~on_edge & (distance < limit)
         if facing:
             own = vertex_normals(torch.from_numpy(mesh[self.number]), torch.from_numpy(self.local)).numpy()[self.place]
             inside &= (own * normal).sum(1) < 0
+        if inside.any():
+            inside &= self._crosses(mesh, surface[local], inside)
         return inside, distance, number[corners], shares, normal
+
+    def _crosses(
+        self, mesh: Float[ndarray, "V 3"], triangles: Float[ndarray, "F 3 3"], inside: ndarray
+    ) -> Bool[ndarray, "U"]:
+        """Vertices whose group of connected ones inside has an edge to the outside that passes through a triangle.
+
+        Behind a surface is not yet in it: in a mouth wide open the inner side of one lip lies behind the other, and
+        pushing it out of what it is not in drives it in.
+        """
+        within = np.zeros(len(self.number), bool)
+        within[self.place] = inside
+        ends = self.ends[within[self.ends].any(1)]
+        both = within[ends].all(1)
+        links = coo_array((np.ones(both.sum()), ends[both].T), shape=(len(within),) * 2)
+        count, groups = connected_components(links, directed=False)
+        out = np.where(within[ends[~both, :1]], ends[~both], ends[~both, ::-1])
+        starts, leads = mesh[self.number[out[:, 0]]], mesh[self.number[out[:, 1]]] - mesh[self.number[out[:, 0]]]
+        lengths = np.linalg.norm(leads, axis=1)
+        nobody = np.full((len(triangles), 3), -1)
+        reach = first_hits(starts, unit_vectors(leads), triangles, nobody, lengths.max(initial=0.0), False)
+        crossing = np.zeros(count, bool)
+        crossing[groups[out[reach <= lengths, 0]]] = True
+        return crossing[groups[self.place]]
