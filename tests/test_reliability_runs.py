@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from reenact import run as run_module
-from reenact import training as module
+from reenact import stages
 from reenact.checkpoint import load_checkpoint, load_tensors
 from reenact.cli import main
 from reenact.errors import ReenactError
@@ -194,13 +194,13 @@ def test_a_second_training_of_a_run_is_refused_and_names_the_first(tmp_path, cap
 def test_a_training_that_was_taken_for_dead_saves_nothing_more(tmp_path, monkeypatch):
     """As on a cluster, where a machine that hung wakes up again."""
     shutil.copytree(STORED, tmp_path / "run")
-    config, render = load_run_config(tmp_path / "run"), module._render
+    config, render = load_run_config(tmp_path / "run"), stages._render
 
     def takeover(*arguments, **keywords):
         (tmp_path / "run" / "lock").write_text('{"pid": 7, "host": "elsewhere", "user": "ana"}')
         return render(*arguments, **keywords)
 
-    monkeypatch.setattr(module, "_render", takeover)
+    monkeypatch.setattr(stages, "_render", takeover)
     with pytest.raises(ReenactError, match="got process 7 of ana on elsewhere"):
         train(config, resume=True)
     assert load_checkpoint(tmp_path / "run").step == 6
@@ -266,14 +266,14 @@ def _going_on(tmp_path):
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_a_loss_that_is_no_number_stops_at_that_step_and_keeps_the_batch(value, tmp_path, monkeypatch):
-    config, losses, steps = _going_on(tmp_path), module._joint_losses, []
+    config, losses, steps = _going_on(tmp_path), stages._joint_losses, []
 
     def wrong(shop, pools, rows, done):
         steps.append(done)
         found = losses(shop, pools, rows, done)
         return {**found, "weights.egg": found["weights.egg"] * value} if len(steps) == 3 else found
 
-    monkeypatch.setattr(module, "_joint_losses", wrong)
+    monkeypatch.setattr(stages, "_joint_losses", wrong)
     with pytest.raises(ReenactError, match=r"run: the loss of networks became .* at step 8; the batch is in .*failed"):
         train(config, resume=True)
     assert len(steps) == 3
@@ -285,13 +285,13 @@ def test_a_loss_that_is_no_number_stops_at_that_step_and_keeps_the_batch(value, 
 
 
 def test_a_gradient_that_is_no_number_stops_before_it_reaches_the_networks(tmp_path, monkeypatch):
-    config, losses = _going_on(tmp_path), module._joint_losses
+    config, losses = _going_on(tmp_path), stages._joint_losses
 
     def wrong(shop, *arguments):
         bias = next(iter(shop.networks.parameters()))
         return {**losses(shop, *arguments), "root": (bias - bias.detach()).abs().sum().sqrt()}  # 0, but 1 / 0 its slope
 
-    monkeypatch.setattr(module, "_joint_losses", wrong)
+    monkeypatch.setattr(stages, "_joint_losses", wrong)
     with pytest.raises(ReenactError, match=r"the gradient of networks became .* at step 6"):
         train(config, resume=True)
     assert load_checkpoint(tmp_path / "run").step == 6
