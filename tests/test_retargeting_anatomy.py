@@ -27,6 +27,7 @@ from reenact.retargeting.tetrahedra import (
     untangle,
     volume_gradient,
 )
+from reenact.rigs import motion
 from reenact.rigs.files import load_rig
 from reenact.rigs.rig import Rig
 
@@ -193,6 +194,15 @@ def test_skin_in_skin_is_seen_and_taken_out(toon, shell, physics):
     assert float(after) < 0.003 * shell.height
     free = FacePhysics(shell, PhysicsConfig(contact=0.0))
     assert float(interpenetration(shell, free(mesh))["lips"]) > float(after)
+
+
+def test_depth_is_no_matter_of_rounding(toon, shell):
+    turn = torch.from_numpy(Rotation.from_euler("xyz", [0.4, -0.3, 0.5]).as_matrix())
+    weights = motion.expressions(toon.names, 12, seed=5)
+    meshes = toon.vertices(weights)
+    turned = interpenetration(shell, meshes.double() @ turn.T)
+    for name, depths in interpenetration(shell, meshes).items():
+        torch.testing.assert_close(turned[name], depths, rtol=0, atol=1e-6 * shell.height)
 
 
 def test_behind_skin_is_not_in_it():

@@ -105,15 +105,15 @@ class Side:
         normal = unit_vectors((normals[corners] * shares[..., None]).sum(1))
         away = points - places
         distance = np.linalg.norm(away, axis=1)
-        # Beside the border of the other side nothing tells in from out; and skin that meets skin faces it.
-        on_edge = other.edge[corners].any(1) | (distance == 0)
+        # Beside the border of the other side nothing tells in from out; and skin that meets skin faces it. On a fold
+        # rounding chose one of two faces: the corner across it does not count, nor does the normal of that face.
+        holds = shares > 1e-6
+        on_edge = (other.edge[corners] & holds).any(1) | (distance == 0)
         flat = np.cross(
             surface[corners[:, 1]] - surface[corners[:, 0]], surface[corners[:, 2]] - surface[corners[:, 0]]
         )
-        # The way out of flesh runs along the normal; a way across it leads around an edge. On a fold which of two faces
-        # was found is a matter of rounding, and its own normal tells nothing.
-        fold = shares.min(1) < 1e-6
-        behind = ((away * normal).sum(1) < -0.5 * distance) & (fold | ((away * flat).sum(1) < 0))
+        # The way out of flesh runs along the normal; a way across it leads around an edge.
+        behind = ((away * normal).sum(1) < -0.5 * distance) & (~holds.all(1) | ((away * flat).sum(1) < 0))
         inside = behind & ~on_edge & (distance < limit)
         if facing:
             own = vertex_normals(torch.from_numpy(mesh[self.number]), torch.from_numpy(self.local)).numpy()[self.place]
@@ -142,5 +142,6 @@ class Side:
         nobody = np.full((len(triangles), 3), -1)
         reach = first_hits(starts, unit_vectors(leads), triangles, nobody, lengths.max(initial=0.0), False)
         crossing = np.zeros(count, bool)
-        crossing[groups[out[reach <= lengths, 0]]] = True
+        # In the corner both sides have vertices in common: an edge that ends in one touches, and does not cross.
+        crossing[groups[out[reach < (1 - 1e-6) * lengths, 0]]] = True
         return crossing[groups[self.place]]
