@@ -19,6 +19,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -482,11 +483,8 @@ def evaluate(
     if frames < 3 * len(KINDS):
         held_out_clips((), frames, seed)  # raises before the slow loading
     say("loading the networks")
-    named = {name: value for name, value in (("source", source), ("target", target)) if value is not None}
-    named |= {} if checkpoint == "newest" else {"checkpoint": checkpoint}
-    named |= {} if device == "cpu" else {"device": device}
-    forward = ImageRetargeter.load(run_dir, **named)
-    reverse = ImageRetargeter.load(run_dir, reverse=True, **named)
+    load = partial(ImageRetargeter.load, run_dir, source=source, target=target, device=device, checkpoint=checkpoint)
+    forward, reverse = load(), load(reverse=True)
     others = {}
     for name in methods:
         say(f"preparing {name}")

@@ -167,7 +167,12 @@ class ComponentReenactNet(nn.Module):
 
     @torch.no_grad()
     def fit(self, keys: list[str], survey: Callable[[str], Float[Tensor, "N C R R"]]) -> None:
-        """Take the components from pictures of each rig, one rig at a time: all at once would fill a memory."""
+        """Take the components from pictures of each rig, one rig at a time: all at once would fill a memory.
+
+        Args:
+            keys: Of the rigs.
+            survey: Gives pictures of a rig, as `Studio.show` makes them; asked once for each.
+        """
         energies, level = {}, []
         for key in keys:
             pictures = survey(key)

@@ -24,7 +24,14 @@ _POSES: tuple[dict[str, float], ...] = (
 
 
 def draw_rigs(names: list[str], size: int, out: Path) -> None:
-    """A row per rig: name, neutral, and a few poses; random expressions where the shapes have no ARKit meaning."""
+    """Write a sheet with a row per rig: name, neutral, and a few poses; random expressions where the shapes have no
+    ARKit meaning.
+
+    Args:
+        names: Built-in rigs, or files.
+        size: Height and width of each picture, in pixels.
+        out: The sheet, in any format of Pillow.
+    """
     count, label = len(_POSES), max(16, size // 8)
     sheet = Image.new("RGB", (size * (1 + count), (size + label) * len(names)), "white")
     for row, name in enumerate(names):

@@ -64,8 +64,10 @@ def toy_config(toy_pair, tmp_path_factory) -> Config:
         target=str(folder / "egg.npz"),
         images=ImageConfig(resolution=32),
         layout=LayoutConfig(steps=10, samples=16),
-        reenactnet=ReenactNetConfig(code=16, components=16, color_components=8, width=32),
-        bpnet=BPNetConfig(hidden=32, steps=12, batch_size=4),
+        reenactnet=ReenactNetConfig(
+            code=16, components=16, color_components=8, width=32, encoder_channels=8, seed_channels=8
+        ),
+        bpnet=BPNetConfig(channels=8, hidden=32, steps=12, batch_size=4),
         training=TrainingConfig(steps=12, batch_size=4, save_every=5, threads=1, frames=16, refresh=7),
     )
 

@@ -234,8 +234,7 @@ def test_every_kind_of_network_trains_a_cast(network, together, toy_config, rig_
         cast=rig_files[:3],
         run=str(tmp_path / "run"),
         pairs=PairsConfig(method="pictures"),
-        reenactnet=replace(toy_config.reenactnet, network=network, encoder_channels=8, seed_channels=8),
-        bpnet=replace(toy_config.bpnet, channels=8),
+        reenactnet=replace(toy_config.reenactnet, network=network),
         training=replace(
             toy_config.training, elastic=0.02, together=together, cycle_loss=0.5 * together, align_loss=0.1 * together
         ),

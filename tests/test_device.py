@@ -71,8 +71,8 @@ def _far(portrait):
 def test_what_a_training_computes_stays_on_its_device(network, together, elsewhere, toy_run, toy_config):
     config = replace(
         toy_config,
-        reenactnet=replace(toy_config.reenactnet, network=network, encoder_channels=8, seed_channels=8),
-        bpnet=replace(toy_config.bpnet, channels=8, image_from=0.0),
+        reenactnet=replace(toy_config.reenactnet, network=network),
+        bpnet=replace(toy_config.bpnet, image_from=0.0),
         training=replace(toy_config.training, together=together, elastic=0.02, cycle_loss=0.5),
     )
     run = replace(toy_run, config=config)

@@ -500,7 +500,7 @@ def test_contacts_are_left_out_where_they_are_unknown(perfect):
 
 
 def test_evaluate_writes_what_it_returns(rigs, monkeypatch, tmp_path):
-    def load(run_dir, reverse=False):
+    def load(run_dir, reverse=False, **_):
         return FakeRetargeter(*(rigs[::-1] if reverse else rigs), copy)
 
     module = types.SimpleNamespace(ImageRetargeter=types.SimpleNamespace(load=load))

@@ -147,8 +147,7 @@ def test_the_best_is_the_least_of_the_logged_numbers(network, toy_config, tmp_pa
     config = replace(
         toy_config,
         run=str(tmp_path / "run"),
-        reenactnet=replace(toy_config.reenactnet, network=network, encoder_channels=8, seed_channels=8),
-        bpnet=replace(toy_config.bpnet, channels=8),
+        reenactnet=replace(toy_config.reenactnet, network=network),
         training=replace(
             toy_config.training, steps=40, save_every=5, keep=1, milestones=14, learning_rate=0.05, schedule="constant"
         ),

@@ -178,8 +178,7 @@ def test_every_kind_of_network_trains_with_every_teacher_and_without(network, pa
         toy_config,
         run=str(tmp_path / "run"),
         pairs=PairsConfig(method=pairs),
-        reenactnet=replace(toy_config.reenactnet, network=network, encoder_channels=8, seed_channels=8),
-        bpnet=replace(toy_config.bpnet, channels=8),
+        reenactnet=replace(toy_config.reenactnet, network=network),
         training=replace(toy_config.training, elastic=0.02, together=together),
     )
     train(config)
@@ -200,8 +199,8 @@ def test_losses_between_the_rigs_train_where_asked(network, toy_config, tmp_path
     config = replace(
         toy_config,
         run=str(tmp_path / "run"),
-        reenactnet=replace(toy_config.reenactnet, network=network, encoder_channels=8, seed_channels=8),
-        bpnet=replace(toy_config.bpnet, channels=8, hidden=0),
+        reenactnet=replace(toy_config.reenactnet, network=network),
+        bpnet=replace(toy_config.bpnet, hidden=0),
         training=replace(toy_config.training, align_loss=0.1, cycle_loss=0.5),
     )
     train(config)
