@@ -4,8 +4,8 @@ A script holds the weights as text and needs nothing but the program that runs i
 names and the other spellings of ARKit's (`matching`), says what it found, and may be run again. The names of a clip are
 from anywhere: they enter the code as escaped ASCII literals, and nothing else of them does.
 
-The Blender script was run in Blender 4.2, 4.5 and 5.0. The Maya script follows Autodesk's documentation of `maya.cmds`;
-here it has only been run against a stand-in that records its calls.
+The Blender script was run in Blender 4.2, 4.5 and 5.0. The Maya script was never run in Maya: each call agrees with the
+signatures of `maya.cmds` that Autodesk documents (mypy with types-maya 0.6.1), and a stand-in records what it does.
 """
 
 from __future__ import annotations
@@ -258,9 +258,9 @@ def key_times():
     except RuntimeError:
         print("{}: Maya has no time unit {}; keys are placed by seconds, between frames".format(CLIP, UNIT))
         return ["{:.9f}sec".format(frame / FPS) for frame in range(FRAMES)]
-    for limit in ("maxTime", "animationEndTime"):
-        end = cmds.playbackOptions(query=True, **{limit: True})
-        cmds.playbackOptions(**{limit: max(end, START + FRAMES - 1)})
+    last = START + FRAMES - 1
+    cmds.playbackOptions(maxTime=max(cmds.playbackOptions(query=True, maxTime=True), last))
+    cmds.playbackOptions(animationEndTime=max(cmds.playbackOptions(query=True, animationEndTime=True), last))
     return list(range(START, START + FRAMES))
 
 
@@ -268,8 +268,11 @@ def key_shape(plug, times, values):
     """Linear keys at the times; False where the plug takes none."""
     try:
         cmds.cutKey(plug, clear=True)
-        linear = {"inTangentType": "linear", "outTangentType": "linear"}
-        return all([cmds.setKeyframe(plug, time=time, value=value, **linear) for time, value in zip(times, values)])
+        keyed = [
+            cmds.setKeyframe(plug, time=time, value=value, inTangentType="linear", outTangentType="linear")
+            for time, value in zip(times, values)
+        ]
+        return all(keyed)
     except RuntimeError:
         return False
 
