@@ -120,6 +120,21 @@ def test_an_empty_clip_has_no_weights(toy_rig):
     assert fit_weights(toy_rig, torch.zeros(0, len(toy_rig.neutral), 3)).shape == (0, 7)
 
 
+def test_any_number_of_threads_finds_the_same_bits():
+    rows = torch.randn(60, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    wanted = torch.randn(1500, 20, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 3):
+            torch.set_num_threads(count)
+            found.append(nonnegative_least_squares(rows.T @ rows, wanted, high=1.0))
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
+    alone = torch.cat([nonnegative_least_squares(rows.T @ rows, row[None], high=1.0) for row in wanted[250:260]])
+    torch.testing.assert_close(found[1][250:260], alone, rtol=0, atol=1e-9)  # across the border of two blocks
+
+
 def test_frames_are_solved_fast_enough_for_real_time():
     _, _, gram, projections = random_problem(8, 52, 300, 500)
     nonnegative_least_squares(gram, projections[:2], 0.0, 1.0)  # compiles

@@ -80,6 +80,13 @@ def test_the_order_of_centers_does_not_matter_and_repeated_centers_count_once():
     torch.testing.assert_close(doubled(points), plate, rtol=0, atol=1e-6)  # stiffness 1e-8
 
 
+def test_points_are_mapped_alike_few_at_a_time(monkeypatch):
+    plate, points = ThinPlate(random_points(30, 0), random_points(30, 1)), random_points(50, 2)
+    at_once = plate(points)
+    monkeypatch.setattr("reenact.retargeting.rbf._DISTANCES", 100)
+    torch.testing.assert_close(plate(points), at_once, rtol=0, atol=1e-12)
+
+
 def test_flat_or_few_centers_are_an_error():
     flat = random_points(20, 0) * torch.tensor([1.0, 1.0, 0.0])
     for centers in (flat, random_points(3, 0)):

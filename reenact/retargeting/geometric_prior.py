@@ -26,7 +26,7 @@ from torch import Tensor
 
 from reenact.errors import ReenactError
 from reenact.geometry import cotangent_laplacian
-from reenact.retargeting.inverse_rig import nonnegative_least_squares
+from reenact.retargeting.inverse_rig import by_blocks, nonnegative_least_squares
 from reenact.rigs.rig import Rig
 
 _EPSILON = 1e-4
@@ -132,7 +132,13 @@ class FrameSolver:
             return nonnegative_least_squares(self.system, wanted - self.thresholds, self.low, self.high, start)
         weights = np.zeros(wanted.shape)
         start = np.zeros(wanted.shape[1]) if last is None else last[0].double().numpy()
-        _reweighted(self._matrix, wanted.numpy(), self._limits, start, last is not None, weights)
+        rows, warm = wanted.numpy(), last is not None
+
+        def reweighted(block: slice) -> None:
+            first = warm and block.start == 0
+            _reweighted(self._matrix, rows[block], self._limits, start, first, weights[block])
+
+        by_blocks(reweighted, len(rows))
         return torch.from_numpy(weights)
 
     def objective(
@@ -160,16 +166,16 @@ def _reweighted(matrix, wanted, thresholds, start, warm, weights):
     objective. Source: RB17, Sec. 5; epsilon, and when to stop, are ours.
     """
     frames, count = wanted.shape
-    factor, found = np.empty((count, count)), np.empty(count)
+    found = np.empty(count)
     before = start.copy()
     for frame in range(frames):
         if not warm:
             found[:] = wanted[frame]
-            _solve_shifted(matrix, np.zeros(count), factor, found)
+            _solve_shifted(matrix, np.zeros(count), found)
             before[:] = found
         for _ in range(_ROUNDS):
             found[:] = wanted[frame]
-            _solve_shifted(matrix, thresholds / np.sqrt(before * before + _EPSILON * _EPSILON), factor, found)
+            _solve_shifted(matrix, thresholds / np.sqrt(before * before + _EPSILON * _EPSILON), found)
             moved = np.abs(found - before).max()
             before[:] = found
             if moved < _SETTLED:
@@ -179,23 +185,20 @@ def _reweighted(matrix, wanted, thresholds, start, warm, weights):
 
 
 @_compiled
-def _solve_shifted(matrix, shift, factor, vector):
-    """Replaces the vector by (matrix + diag(shift))^-1 vector, by Cholesky."""
+def _solve_shifted(matrix, shift, vector):
+    """Replaces the vector by (matrix + diag(shift))^-1 vector."""
     count = len(vector)
+    shifted = matrix.copy()
     for i in range(count):
-        for j in range(i):
-            value = matrix[i, j]
-            for m in range(j):
-                value -= factor[i, m] * factor[j, m]
-            factor[i, j] = value / factor[j, j]
-        value = matrix[i, i] + shift[i]
+        shifted[i, i] += shift[i]
+    factor = np.linalg.cholesky(shifted)
+    for i in range(count):
+        row = factor[i]
         for m in range(i):
-            value -= factor[i, m] * factor[i, m]
-        factor[i, i] = np.sqrt(max(value, 1e-300))
-        for m in range(i):
-            vector[i] -= factor[i, m] * vector[m]
-        vector[i] /= factor[i, i]
+            vector[i] -= row[m] * vector[m]
+        vector[i] /= row[i]
     for i in range(count - 1, -1, -1):
-        for m in range(i + 1, count):
-            vector[i] -= factor[m, i] * vector[m]
-        vector[i] /= factor[i, i]
+        row = factor[i]
+        vector[i] /= row[i]
+        for m in range(i):
+            vector[m] -= row[m] * vector[i]

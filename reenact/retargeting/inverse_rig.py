@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import inspect
 import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numba
 import numpy as np
@@ -28,6 +30,8 @@ from reenact.retargeting.correspondence import Places
 from reenact.rigs.rig import Rig
 
 _CHUNK = 256  # frames at a time: bounds memory, not results
+_BLOCK = 256
+"""Frames in a row that one thread solves, the first of them from rest."""
 
 
 def nonnegative_least_squares(
@@ -73,9 +77,13 @@ def nonnegative_least_squares(
     matrix = np.ascontiguousarray(matrix + (extra + 1e-300) * np.eye(len(matrix)))
     rest = min(max(0.0, low), high)
     weights = np.full(wanted.shape, rest) if start is None else start.detach().cpu().to(torch.float64).numpy().copy()
-    _solve(matrix, wanted, low, high, weights, start is None)
+
+    def solve(wanted: np.ndarray, chained: bool) -> None:
+        by_blocks(lambda block: _solve(matrix, wanted[block], low, high, weights[block], chained), len(wanted))
+
+    solve(wanted, start is None)
     if extra > 0:
-        _solve(matrix, wanted + extra * weights, low, high, weights, False)
+        solve(wanted + extra * weights, False)
     if smoothness > 0 and len(weights) > 1:
         _smooth(matrix, wanted + extra * weights, low, high, smoothness, weights)
     return torch.from_numpy(weights)
@@ -175,6 +183,21 @@ def fit_weights(
     Source: the least squares problem of CB02, Eq. 4, on offsets from the neutral; we add the upper bound.
     """
     return InverseRig(rig, places)(vertices, ridge, smoothness, low, high)
+
+
+def by_blocks(work: Callable[[slice], object], count: int) -> None:
+    """Does work on some hundred frames at a time, on as many threads as torch has.
+
+    Blocks do not depend on the number of threads, and neither do results. The work must let go of Python's lock.
+    """
+    blocks = [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
+    workers = min(torch.get_num_threads(), len(blocks))
+    if workers < 2:
+        for block in blocks:
+            work(block)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(work, blocks))
 
 
 # The loops, on numpy arrays -------------------------------------------------------------------------------------------

@@ -28,6 +28,9 @@ from reenact.retargeting.retargeter import check_names
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
+_DISTANCES = 2**24
+"""Distances between points and centers that are in memory at a time."""
+
 
 class ThinPlate:
     """The smoothest map that takes the centers to the values: R(x) = [1, x] B + sum_m W_m |x - c_m|.
@@ -75,10 +78,11 @@ class ThinPlate:
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch D"]:
         """The map at the points, in their precision."""
-        x = self._normalised(points)
-        distances = torch.cdist(x, self._points, compute_mode="donot_use_mm_for_euclid_dist")
-        mapped = self._affine[0] + x @ self._affine[1:] + distances @ self._kernel
-        return mapped.reshape(*points.shape[:-1], -1).to(points.dtype)
+        mapped = []
+        for x in self._normalised(points).split(max(1, _DISTANCES // len(self._points))):
+            distances = torch.cdist(x, self._points, compute_mode="donot_use_mm_for_euclid_dist")
+            mapped.append(self._affine[0] + x @ self._affine[1:] + distances @ self._kernel)
+        return torch.cat(mapped).reshape(*points.shape[:-1], -1).to(points.dtype)
 
     def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch D 3"]:
         """Derivative of the map by the points. At a center, whose own term has a kink, that term counts 0."""

@@ -31,6 +31,9 @@ from reenact.retargeting.retargeter import check_names
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 
+_PLACES = 1024
+"""Places whose motion is averaged at a time; bounds memory."""
+
 
 @dataclass(frozen=True)
 class ShapeMatchingConfig:
@@ -144,13 +147,13 @@ class ShapeMatching:
         """Motions of both rigs' shapes as rows, averaged over neighbouring places and weighted by confidence."""
         places = self.carried.source_neutral
         width = config.blur * float((places - places.mean(0)).square().sum(1).mean().sqrt())
-        near = torch.exp(-torch.cdist(places, places).square() / (2 * width**2)) * self.carried.confidence
-        near = near / near.sum(1, keepdim=True).clamp_min(1e-12) * self.carried.confidence.sqrt()[:, None]
-        ours, theirs = (
-            torch.einsum("nm,kmi->kni", near, shapes).flatten(1)
-            for shapes in (self.carried.source_shapes, self.carried.guess)
-        )
-        return ours, theirs
+        ours, theirs = [], []
+        for some, trust in zip(places.split(_PLACES), self.carried.confidence.split(_PLACES)):
+            near = torch.exp(-torch.cdist(some, places).square() / (2 * width**2)) * self.carried.confidence
+            near = near / near.sum(1, keepdim=True).clamp_min(1e-12) * trust.sqrt()[:, None]
+            ours.append(torch.einsum("nm,kmi->kni", near, self.carried.source_shapes).flatten(1))
+            theirs.append(torch.einsum("nm,kmi->kni", near, self.carried.guess).flatten(1))
+        return torch.cat(ours, 1), torch.cat(theirs, 1)
 
 
 def find_partners(
