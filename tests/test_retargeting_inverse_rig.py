@@ -130,7 +130,8 @@ def test_any_number_of_threads_finds_the_same_bits():
             found.append(nonnegative_least_squares(rows.T @ rows, wanted, high=1.0))
     finally:
         torch.set_num_threads(threads)
-    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
+    assert torch.equal(found[0], found[1])
+    assert torch.equal(found[0], found[2])
     alone = torch.cat([nonnegative_least_squares(rows.T @ rows, row[None], high=1.0) for row in wanted[250:260]])
     torch.testing.assert_close(found[1][250:260], alone, rtol=0, atol=1e-9)  # across the border of two blocks
 
