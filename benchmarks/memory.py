@@ -1,6 +1,6 @@
 """Peak memory and time of a short training against vertices, shapes, resolution and batch.
 
-python benchmarks/memory.py [--json FILE] [--method pictures|geometry|none] [--only NAME=VALUE ...]
+python benchmarks/memory.py [--json FILE] [--method pictures|geometry|none] [--default-networks] [--only NAME=VALUE ...]
 
 Each case is a process of its own, that trains a made-up head and the same head stretched, for a few steps with all
 that a training does; its peak is what the system says (resident set, of Python and PyTorch 0.5 GiB). One setting at a
@@ -36,11 +36,12 @@ def main() -> None:
     parser.add_argument(
         "--method", default="pictures", help="who teaches; registration (geometry) adds minutes to a case"
     )
+    parser.add_argument("--default-networks", action="store_true", help="as large as in a real training")
     parser.add_argument("--only", nargs="*", metavar="NAME=VALUE")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.child:
-        print(json.dumps(trained(json.loads(arguments.child), arguments.method)))
+        print(json.dumps(trained(json.loads(arguments.child), arguments.method, arguments.default_networks)))
         return
     if arguments.only is not None:
         chosen = dict(part.split("=") for part in arguments.only)
@@ -50,7 +51,7 @@ def main() -> None:
         cases.append(("large", LARGE))
     found = []
     for name, case in cases:
-        found.append({"series": name, **case, **measured(case, arguments.method)})
+        found.append({"series": name, **case, **measured(case, arguments.method, arguments.default_networks)})
         print(json.dumps(found[-1]), flush=True)
         if arguments.json:
             arguments.json.write_text(json.dumps(found, indent=1) + "\n")
@@ -59,22 +60,28 @@ def main() -> None:
         print(line)
 
 
-def measured(case: dict[str, int], method: str) -> dict[str, float | str]:
+def measured(case: dict[str, int], method: str, large: bool) -> dict[str, float | str]:
     """What a process of its own says; "failed" where it died."""
     command = [sys.executable, __file__, "--child", json.dumps(case), "--method", method]
+    command += ["--default-networks"] * large
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         return {"failed": (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1]}
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def trained(case: dict[str, int], method: str) -> dict[str, float]:
-    """Peak (GiB) and seconds of one case, in this process."""
+def trained(case: dict[str, int], method: str, large: bool) -> dict[str, float]:
+    """Peak (GiB) and seconds of one case, in this process; `large` networks are the default ones."""
     from reenact.config import BPNetConfig, Config, ImageConfig, PairsConfig, ReenactNetConfig, TrainingConfig
     from reenact.rigs.files import save_rig
     from reenact.training import train
 
     steps = 20
+    reenactnet = ReenactNetConfig(components=64, color_components=32, width=128, code=64)
+    bpnet = BPNetConfig(hidden=128, image_from=0.5)
+    frames = 256
+    if large:
+        reenactnet, bpnet, frames = ReenactNetConfig(), BPNetConfig(image_from=0.5), 1024
     with tempfile.TemporaryDirectory() as folder:
         paths = [Path(folder) / f"{name}.npz" for name in ("one", "other")]
         for path, stretch in zip(paths, (1.0, 1.2)):
@@ -85,10 +92,10 @@ def trained(case: dict[str, int], method: str) -> dict[str, float]:
             run=f"{folder}/run",
             images=ImageConfig(resolution=case["resolution"]),
             pairs=PairsConfig(method=method),
-            reenactnet=ReenactNetConfig(components=64, color_components=32, width=128, code=64),
-            bpnet=BPNetConfig(hidden=128, image_from=0.5),
+            reenactnet=reenactnet,
+            bpnet=bpnet,
             training=TrainingConfig(
-                steps=steps, batch_size=case["batch"], frames=256, refresh=0, save_every=steps, threads=1
+                steps=steps, batch_size=case["batch"], frames=frames, refresh=0, save_every=steps, threads=1
             ),
         )
         started = time.perf_counter()
