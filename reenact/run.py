@@ -229,18 +229,26 @@ class Run:
         )
 
     def correspondence(self, source: str, target: str) -> Correspondence | None:
-        """Pairs of places from one rig to another, by their keys; None where the settings ask for none."""
+        """Pairs of places from one rig to another, by their keys, as many as the settings say; None for no geometry."""
         if not self.correspondences:
             return None
-        known, back = (self.correspondences.get(pair) for pair in ((source, target), (target, source)))
-        if known is None and back is not None:
-            known = back.reversed()
+        pairs = self.config.pairs
         if not self.config.cast:
+            (first, second), known = next(iter(self.correspondences.items()))
+            if pairs.correspondence is None:  # a given file is taken as it is
+                known = known.sample(self.rigs[first], pairs.markers)
+            return known if (source, target) == (first, second) else known.reversed()
+        return self._dense(source, target).sample(self.rigs[source], pairs.markers)
+
+    def _dense(self, source: str, target: str) -> Correspondence:
+        """All pairs of places that are known, between two rigs of a cast by way of its first."""
+        known, back = (self.correspondences.get(pair) for pair in ((source, target), (target, source)))
+        if known is not None:
             return known
-        if known is None:
-            first = self.keys[0]
-            known = self.correspondences[first, source].reversed().then(self.correspondences[first, target])
-        return known.sample(self.rigs[source], self.config.pairs.markers)
+        if back is not None:
+            return back.reversed()
+        first = self.keys[0]
+        return self.correspondences[first, source].reversed().then(self.correspondences[first, target])
 
     def teacher(self, source: Studio, target: Studio, source_key: str, target_key: str) -> Teacher:
         """What is known of one rig's expressions on another; the settings must ask for pairs.
@@ -343,7 +351,7 @@ def _find_layouts(run: Run, base: Run | None) -> dict[str, Tensor]:
     reference, *others = rigs
     layouts = {} if base is None else dict(base.layouts)
     for key in [key for key in others if key not in layouts]:
-        known = run.correspondence(reference, key)
+        known = run.correspondences.get((reference, key))
         if config.method == "found" and known is not None:
             layouts[key] = lay_out(rigs[reference], rigs[key], known, _LAYOUT_RESOLUTION)
         else:
@@ -355,14 +363,13 @@ def _find_layouts(run: Run, base: Run | None) -> dict[str, Tensor]:
 def _find_correspondences(
     rigs: dict[str, Rig], config: Config, base: Run | None = None
 ) -> dict[tuple[str, str], Correspondence]:
-    """From the first rig to each other, where the settings let geometry teach; those of a cast are dense."""
+    """From the first rig to each other, where the settings let geometry teach; those that are found are dense."""
     found, given = {}, config.pairs.correspondence
-    count = None if config.cast else config.pairs.markers
     for first, second in _registered(rigs, config):
         if base is not None and base.config.cast and (first, second) in base.correspondences:
             found[first, second] = base.correspondences[first, second]
         elif given is None:
-            found[first, second] = find_correspondence(rigs[first], rigs[second], count)
+            found[first, second] = find_correspondence(rigs[first], rigs[second], None)
         else:
             found[first, second] = load_correspondence(given, rigs[first], rigs[second])
     return found
