@@ -79,11 +79,12 @@ _FACING = 0.2
 _MOST = 4000
 """Pairs that the warp follows, of those that are given: what each gets wrong averages out among its neighbours, and the
 time grows with the cube."""
-_SMOOTHING = 10.0
-"""How far the warp may miss pairs of places, which are found one by one; squared pixels of 64, about."""
+_SMOOTHING = 1 / 300
+"""How far the warp may miss pairs of places, which are found one by one, for each of them, so that it is as smooth
+whatever their number; squared pixels of 64, about."""
 _ROUNDS = 3
-"""How often pairs that the warp misses by more than is usual lose weight. Between a man and ICT FaceKit some on the
-lids contradict their neighbours, and would fold the picture."""
+"""How often found pairs that the warp misses by more than is usual lose weight. Between a man and ICT FaceKit some on
+the lids contradict their neighbours, and would fold the picture."""
 
 
 def lay_out(
@@ -92,7 +93,8 @@ def lay_out(
     """The sampling grid that warps pictures of the target onto the layout of the source, from pairs of places. Ours.
 
     A thin-plate spline through where both rigs' pictures show the pairs that face the camera in both; the denser they
-    are, the more exact it is. Pairs that contradict the others lose their weight (least squares, reweighted).
+    are, the more exact it is. Those that are not certain and contradict the others lose weight (reweighted least
+    squares).
 
     Args:
         source: Its pictures stay where they are.
@@ -115,11 +117,12 @@ def lay_out(
             f'{int(seen.sum())}; give more with pairs.correspondence, or set layout.method to "pictures"'
         )
     at, move = here[seen].double().numpy(), (there - here)[seen].double().numpy()
+    certain = (correspondence.confidence[seen] == 1).numpy()
     trust = np.ones(len(at))
-    for _ in range(_ROUNDS + 1):
-        moved = RBFInterpolator(at, move, kernel="thin_plate_spline", smoothing=_SMOOTHING / trust)
+    for _ in range(1 if certain.all() else _ROUNDS + 1):
+        moved = RBFInterpolator(at, move, kernel="thin_plate_spline", smoothing=_SMOOTHING * len(at) / trust)
         miss = np.linalg.norm(moved(at) - move, axis=1)
-        trust = 1 / (1 + np.square(miss / (2 * np.median(miss) + 1e-3)))
+        trust = np.where(certain, 1.0, 1 / (1 + np.square(miss / (2 * np.median(miss) + 1e-3))))
     grid = identity_grid(resolution)
     pixels = (grid + 1) * 32
     displacement = torch.from_numpy(moved(pixels.flatten(0, 1).double().numpy())).float()
