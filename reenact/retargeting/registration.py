@@ -47,11 +47,11 @@ STILL = 0.02
 """A shape that moves the face by less than this share of the farthest moving one says nothing about it."""
 _FLOOR = 0.003
 """Share of a shape's farthest motion below which its logarithm flattens."""
-_DIMENSIONS = 80
+_DIMENSIONS = 140
 """Principal components that the motion of all shapes is reduced to."""
 _NORMAL_WEIGHT = 6.0
 """A turn by 10 degrees counts as much as one standard deviation of the position."""
-_SCALES = (0.1, 0.2, 0.2, 0.2, 0.15, 0.1, 0.07, 0.05, 0.04, 0.03, 0.03)
+_SCALES = (0.1, 0.2, 0.2, 0.2, 0.15, 0.1, 0.07, 0.05, 0.04, 0.03, 0.03, 0.02, 0.02, 0.015, 0.015)
 """Standard deviation of a partner's position, coarse to fine, in face heights."""
 _BELIEF = 1.5
 """What disagreement of motion as large as usual counts, in standard deviations of the position."""
