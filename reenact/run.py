@@ -235,7 +235,7 @@ class Run:
         pairs = self.config.pairs
         if not self.config.cast:
             (first, second), known = next(iter(self.correspondences.items()))
-            if pairs.correspondence is None:  # a given file is taken as it is
+            if pairs.correspondence is None and len(known) > pairs.markers:  # a given file is taken as it is
                 known = known.sample(self.rigs[first], pairs.markers)
             return known if (source, target) == (first, second) else known.reversed()
         return self._dense(source, target).sample(self.rigs[source], pairs.markers)
