@@ -186,7 +186,7 @@ def _reweighted(matrix, wanted, thresholds, start, warm, weights):
 
 @_compiled
 def _solve_shifted(matrix, shift, vector):
-    """Replaces the vector by (matrix + diag(shift))^-1 vector."""
+    """Replaces the vector (K,) by (matrix + diag(shift))^-1 vector, by Cholesky."""
     count = len(vector)
     shifted = matrix.copy()
     for i in range(count):

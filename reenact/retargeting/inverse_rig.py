@@ -188,7 +188,11 @@ def fit_weights(
 def by_blocks(work: Callable[[slice], object], count: int) -> None:
     """Does work on some hundred frames at a time, on as many threads as torch has.
 
-    Blocks do not depend on the number of threads, and neither do results. The work must let go of Python's lock.
+    Blocks do not depend on the number of threads, and neither do results. Ours.
+
+    Args:
+        work: Solves the frames of a slice, in place; it must let go of Python's lock to gain anything.
+        count: Frames in all.
     """
     blocks = [slice(start, start + _BLOCK) for start in range(0, count, _BLOCK)]
     workers = min(torch.get_num_threads(), len(blocks))
