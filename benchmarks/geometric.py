@@ -199,10 +199,6 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the numbers there")
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--skip", nargs="+", choices=["personalise", "frames", "slopes", "key-shapes", "rigs"], default=[])
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
-    results: dict = {"threads": arguments.threads, "repeats": arguments.repeats}
     parts = {
         "personalise": measure_personalisation,
         "frames": measure_frames,
@@ -210,6 +206,10 @@ def main() -> None:
         "key-shapes": measure_key_shapes,
         "rigs": measure_rigs,
     }
+    parser.add_argument("--skip", nargs="+", choices=list(parts), default=[])
+    arguments = parser.parse_args()
+    torch.set_num_threads(arguments.threads)
+    results: dict = {"threads": arguments.threads, "repeats": arguments.repeats}
     for name, measure in parts.items():
         if name not in arguments.skip:
             results |= measure(arguments.repeats)
