@@ -1,8 +1,9 @@
 """How far found correspondences miss, on heads of one topology, whose truth is known and is not used by the search.
 
-The built-in characters have the same vertices in the same order, so the partner of a vertex is the one of its number. Errors
-are distances on the target in percent of the height of its face, from the root of the nose to the chin. The search never
-reads vertex numbers: tests/test_retargeting_correspondence.py has it find the same pairs on a head with scrambled ones.
+The built-in characters have the same vertices in the same order, so the partner of a vertex is the one of its number.
+Errors are distances on the target in percent of the height of its face, from the root of the nose to the chin. The
+search never reads vertex numbers: tests/test_retargeting_correspondence.py has it find the same pairs on a head
+with scrambled ones.
 `--json FILE` writes what the tables say:
 
     pairs["anny:man anny:toon"].named.markers, .places    median and 95th percentile, of 99 markers and of all places

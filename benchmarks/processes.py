@@ -1,8 +1,8 @@
 """One process against several on one training, by turns: seconds from the first rendering to the end.
 
-Every process has one thread. What comes before (rigs, components, layouts) is the first process's alone and is not counted.
-Medians of several turns; on a machine that others use, the slower process of each step decides. `--json FILE` writes
-seconds["1"], ["2"]: one number a turn.
+Every process has one thread. What comes before (rigs, components, layouts) is the first process's alone and is not
+counted. Medians of several turns; on a machine that others use, the slower process of each step decides. `--json FILE`
+writes seconds["1"], ["2"]: one number a turn.
 
     python benchmarks/processes.py [--processes 1 2] [--turns 3] [--steps 80] [--json FILE]
 """

@@ -788,14 +788,21 @@ def true_numbers(
 
 
 def contacts_of(rig: Rig) -> dict[str, Tensor]:
-    """Pairs of vertices that meet when lids and lips close, where they are known."""
-    if not rig.name.startswith("anny:"):
-        return {}
-    from reenact.rigs import anny  # reads its assets; other rigs need not wait for that
+    """Pairs of vertices (N, 2) that meet when `lips`, `lids_left` and `lids_right` close, those that are known.
 
-    if rig.name not in anny.BUILT_IN:
+    Of a built-in character they are marked on its mesh; of another rig they are what its shapes show, see
+    `retargeting.landmarks`, and nothing where no shape opens a jaw or closes lids.
+    """
+    from reenact.retargeting.landmarks import Landmarks
+    from reenact.rigs import anny  # reads its assets
+
+    if rig.name in anny.BUILT_IN:
+        return {key: torch.as_tensor(pairs) for key, pairs in anny.contacts(rig.name).items()}
+    try:
+        contacts = Landmarks.of(rig).contacts
+    except ReenactError:  # no face moves
         return {}
-    return {key: torch.as_tensor(pairs) for key, pairs in anny.contacts(rig.name).items()}
+    return {key: contact.pairs for key, contact in contacts.items()}
 
 
 def _face_height(rig: Rig, contacts: dict[str, Tensor]) -> float:

@@ -6,6 +6,7 @@ import json
 import math
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -531,3 +532,25 @@ def test_a_method_takes_the_correspondence_that_the_run_found():
     assert evaluation._correspondence(forward, "rbf") is found
     reversed_ = evaluation._correspondence(back, "rbf")
     assert (reversed_.source, reversed_.target) == (found.target, found.source)
+
+
+def test_lids_and_lips_of_any_rig_are_found_and_tell_the_same_blinks_and_nearly_the_same_contacts_as_marked_ones():
+    from reenact.rigs.files import load_rig
+
+    man = load_rig("anny:man")
+    stranger = replace(man, name="mine.glb", names=tuple(f"shape {index}" for index in range(len(man.names))))
+    marked, found = evaluation.contacts_of(man), evaluation.contacts_of(stranger)
+    assert set(found) == set(marked)
+    weights = torch.cat([clip.weights for clip in evaluation.held_out_clips(man.names, 600, seed=3).values()])
+    for key in ("lids_left", "lids_right"):
+        runs = [evaluation.lid_closure(man, 0.9 * weights, weights, pairs[key]) for pairs in (marked, found)]
+        assert runs[0]["blinks"] == runs[1]["blinks"] > 0
+        assert runs[0]["blink_f1"] == runs[1]["blink_f1"]
+    height = 0.12
+    runs = [evaluation.lip_contact(man, weights, weights, pairs["lips"], height) for pairs in (marked, found)]
+    assert runs[0]["contacts"] > 10
+    assert abs(runs[0]["contacts"] - runs[1]["contacts"]) <= 2  # a gap that is just as wide as a contact may be
+
+
+def test_a_rig_that_does_not_move_has_no_contacts(toy_rig):
+    assert evaluation.contacts_of(replace(toy_rig, deltas=torch.zeros_like(toy_rig.deltas))) == {}
