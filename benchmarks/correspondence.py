@@ -3,13 +3,12 @@
 The built-in characters have the same vertices in the same order, so the partner of a vertex is the one of its number.
 Errors are distances on the target in percent of the height of its face, from the root of the nose to the chin. The
 search never reads vertex numbers: tests/test_retargeting_correspondence.py has it find the same pairs on a head
-with scrambled ones.
-`--json FILE` writes what the tables say:
+with scrambled ones. `--json FILE` writes what the tables say:
 
-    pairs["anny:man anny:toon"].named.markers, .places    median and 95th percentile, of 99 markers and of all places
-    pairs["anny:man anny:toon"].motion                    the same without the names of shapes
-    pairs["anny:man anny:toon"].named.confidence          per fifth of the pairs, least sure first: mean confidence, and
-                                                          the share of them that is right to 1 %
+    pairs["man toon"].named.markers, .places    median and 95th percentile, of 99 markers and of all places
+    pairs["man toon"].motion                    the same without the names of shapes
+    pairs["man toon"].named.confidence          per fifth of the pairs, least sure first: mean confidence, and the share
+                                                of them that is right to 1 %
 
     python benchmarks/correspondence.py [--pairs "man toon" ...] [--json FILE] [--threads N]
 """
@@ -40,7 +39,10 @@ UNSEEN = ("woman toon", "merged woman")
 
 
 def face_height(rig: Rig) -> float:
-    """Root of the nose to chin, metres: 1.8 times the height of the eyes above the lips, as in an average adult."""
+    """Root of the nose to chin, metres: 1.8 times the height of the eyes above the lips, as in an average adult.
+
+    By the marked parts, not by `landmarks`, which are told by the same motion as the search.
+    """
     heights = {part: rig.neutral[rig.part(part), 1] for part in ("eyes", "lips")}
     eyes, lips = ((values.amin() + values.amax()) / 2 for values in heights.values())
     return 1.8 * float(eyes - lips)
@@ -48,11 +50,12 @@ def face_height(rig: Rig) -> float:
 
 def errors(pairs: Correspondence, target: Rig) -> np.ndarray:
     """Percent of the face's height by which each pair (N,) misses the target's vertex of the source's number."""
-    truth = target.neutral[pairs.source.corners[:, 0]]
+    truth = pairs.source.of(target.neutral)
     return (100 * (pairs.target.of(target.neutral) - truth).norm(dim=1) / face_height(target)).numpy()
 
 
 def measure(source: Rig, target: Rig, use_names: bool) -> dict:
+    """What `--json` holds of one search, see above, with the number of places and the seconds that it took."""
     start = time.perf_counter()
     places = find_correspondence(source, target, None, use_names)
     seconds = time.perf_counter() - start

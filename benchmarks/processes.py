@@ -25,7 +25,7 @@ SETTINGS += ("--training.frames", "1024", "--training.refresh", "0", "--training
 
 
 def seconds(processes: int, steps: int) -> float:
-    """Of one training of man and toon in a folder that is thrown away.
+    """Wall time of one training of man and toon in a folder that is thrown away.
 
     Raises:
         RuntimeError: It did not end as it should.
@@ -34,7 +34,8 @@ def seconds(processes: int, steps: int) -> float:
         command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", str(processes), "--"]
         command += [str(ROOT / "train.py"), "--run", f"{folder}/run", "--training.steps", str(steps), *SETTINGS]
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
-        began, said = None, []
+        began = ended = None
+        said = []
         with subprocess.Popen(
             command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         ) as training:
@@ -42,9 +43,9 @@ def seconds(processes: int, steps: int) -> float:
                 said.append(line)
                 if began is None and "fresh expressions" in line:
                     began = time.perf_counter()
-                if line.startswith("Trained:") and began is not None:
+                if line.startswith("Trained:"):
                     ended = time.perf_counter()
-        if training.returncode != 0 or began is None:
+        if training.returncode != 0 or began is None or ended is None:
             raise RuntimeError("".join(said[-20:]))
     return ended - began
 
