@@ -115,6 +115,13 @@ def mesh_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "E 2"]:
     return edges[edges[:, 0] != edges[:, 1]]
 
 
+def boundary_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "E 2"]:
+    """Edges with one face only."""
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    return unique[count == 1]
+
+
 def outward_faces(
     points: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], open_share: float = 0.05
 ) -> Bool[np.ndarray, "F"]:

@@ -15,6 +15,7 @@ from reenact.retargeting.correspondence import (
     load_correspondence,
     save_correspondence,
 )
+from reenact.retargeting.face import Face
 from reenact.rigs.files import load_rig
 from reenact.rigs.rig import Rig
 
@@ -220,7 +221,7 @@ def test_pairs_that_do_not_move_cannot_be_sampled(toy_rig):
 
 def test_landmarks_are_kept_and_the_rest_lies_between_them(man):
     woman = load_rig("anny:woman")
-    given = Correspondence.identity(man, woman)[torch.from_numpy(registration.Face.of(man).vertices)]
+    given = Correspondence.identity(man, woman)[torch.from_numpy(Face.of(man).vertices)]
     marks = given.sample(man, 40).source.corners[:, 0]
     found = from_landmarks(man, woman, marks, marks)
     kept = torch.isin(found.source.corners[:, 0], marks)
@@ -233,7 +234,7 @@ def test_landmarks_are_kept_and_the_rest_lies_between_them(man):
 
 
 def test_landmarks_must_be_enough_on_the_skin_and_not_on_a_line(man):
-    skin = torch.from_numpy(registration.Face.of(man).vertices)
+    skin = torch.from_numpy(Face.of(man).vertices)
     with pytest.raises(ReenactError, match="at least 4"):
         from_landmarks(man, man, skin[:3], skin[:3])
     with pytest.raises(ReenactError, match="99999"):

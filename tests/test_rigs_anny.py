@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from reenact.errors import ReenactError
+from reenact.geometry import boundary_edges
 from reenact.rigs import anny, arkit, head, makehuman
 from reenact.rigs.personalise import Transfer
 from reenact.rigs.rig import PARTS
@@ -83,7 +84,7 @@ def test_faces_are_wound_alike_and_the_skin_opens_only_at_the_neck(cast, name):
     edges = torch.cat([rig.faces[:, [0, 1]], rig.faces[:, [1, 2]], rig.faces[:, [2, 0]]])
     _, count = edges.unique(dim=0, return_counts=True)
     assert int(count.max()) == 1  # two faces that share an edge run along it in opposite directions
-    rim = head.boundary_edges(head.load_head().faces)
+    rim = boundary_edges(head.load_head().faces)
     starts, times = np.unique(rim, return_counts=True)
     assert (times == 2).all()  # a closed line
     assert _components(rim) == 1

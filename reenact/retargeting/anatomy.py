@@ -12,7 +12,7 @@ F_e           gradient of a tetrahedron, (3, 3): what it was turned and stretche
 H             height of the face, root of the nose to chin; what is said in shares is in shares of it
 bone          0 for what is free, `SKULL` or `JAW` for what is grown to one
 
-Only the sheet that shapes move is tissue (`registration.Face`), with a margin of still skin, whose border is fixed.
+Only the sheet that shapes move is tissue (`face.Face`), with a margin of still skin, whose border is fixed.
 Eyes, teeth, tongue, lashes and the lining of the mouth stay outside: see `Rest`.
 """
 
@@ -32,6 +32,7 @@ from torch import Tensor
 
 from reenact.errors import ReenactError
 from reenact.geometry import (
+    boundary_edges,
     closest_points_around,
     cotangent_laplacian,
     face_areas,
@@ -43,6 +44,7 @@ from reenact.geometry import (
 )
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import connected_pieces, vertex_pairs
+from reenact.retargeting.face import Face
 from reenact.retargeting.landmarks import (
     Contact,
     Landmarks,
@@ -52,7 +54,6 @@ from reenact.retargeting.landmarks import (
     smoothing_matrix,
 )
 from reenact.retargeting.rbf import ThinPlate
-from reenact.retargeting.registration import Face
 from reenact.retargeting.tetrahedra import (
     factored,
     first_hits,
@@ -63,7 +64,6 @@ from reenact.retargeting.tetrahedra import (
     tet_volumes,
     untangle,
 )
-from reenact.rigs.head import boundary_edges
 from reenact.rigs.rig import Rig
 
 SKULL, JAW = 1, 2

@@ -13,13 +13,13 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from reenact.geometry import (
+    boundary_edges,
     closest_points,
     mesh_edges,
     vertex_normals,
 )
 from reenact.retargeting.anatomy import Shell, unit_vectors
 from reenact.retargeting.tetrahedra import first_hits
-from reenact.rigs.head import boundary_edges
 from reenact.rigs.rig import Rig
 
 _DEEPEST = {"lips": 0.06, "lids_left": 0.03, "lids_right": 0.03}

@@ -14,6 +14,7 @@ from torch import Tensor
 from reenact.errors import ReenactError
 from reenact.geometry import farthest_points
 from reenact.retargeting import registration
+from reenact.retargeting.face import STILL
 from reenact.retargeting.thinning import thinned
 from reenact.rigs.formats import disk, npz, table
 from reenact.rigs.rig import Rig
@@ -99,7 +100,7 @@ class Correspondence:
         """
         reach = rig.deltas.norm(dim=-1).amax(1)  # (K,)
         motion = self.source.of(rig.deltas).norm(dim=-1)  # (K, N)
-        live = reach > registration.STILL * reach.max()
+        live = reach > STILL * reach.max()
         strength = (motion[live] / reach[live, None]).square().sum(0)  # the more shapes, and the nearer to their middle
         weights = (strength.sqrt() * self.confidence).sqrt()
         weights = torch.where(weights > 1e-2 * weights.max(), weights, 0)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from reenact.geometry import edge_graph, mesh_edges, nearest_along, rigid_fit
 from reenact.retargeting.deformation_transfer import connected_pieces
-from reenact.retargeting.registration import Face
+from reenact.retargeting.face import Face
 from reenact.rigs.rig import Rig
 
 
@@ -67,7 +67,7 @@ class Landmarks:
     def of(cls, rig: Rig) -> Landmarks:
         """
         Raises:
-            ReenactError: The shapes move no face, see `registration.Face`.
+            ReenactError: The shapes move no face, see `face.Face`.
         """
         face = Face.of(rig)
         points, height = face.points, face.height

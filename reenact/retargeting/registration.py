@@ -3,8 +3,9 @@
 Ours, on two known ideas: a non-rigid iterative closest point search in which the deformed source bends as little as it
 can (Amberg et al. 2007, "Optimal Step Nonrigid ICP Algorithms for Surface Registration", doi:10.1109/CVPR.2007.383165,
 bends by another measure), and descriptors in the search space beside the positions. Every vertex is a point of a space
-with three kinds of coordinates: where it rests, where its surface faces, and how each shape moves it. In that space
-both faces are surfaces of triangles, and the closest point of the target's surface is the partner.
+with four kinds of coordinates: where it rests, where its surface faces, how near the rim of an eye or the mouth it is,
+and how each shape moves it. In that space both faces are surfaces of triangles, and the closest point of the target's
+surface is the partner.
 
 Motion is what tells a lid's margin from the skin a millimetre above it. It enters as logarithms of how far a shape
 moves a point, so that a shape with twice the range is the same descriptor shifted, and a shift that changes slowly over
@@ -13,7 +14,6 @@ names where these say it, and otherwise found from where and how they move the f
 vertices, texture coordinates or topology.
 
 Code              Meaning
-Face              the one connected sheet of a rig that its shapes move: skin and lips
 groups            shapes that count as one: `blink` of one rig is `blinkLeft` and `blinkRight` of another
 features          (N, D) how the shapes move each vertex, see `_features`
 """
@@ -26,31 +26,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.sparse import coo_array, csc_array, diags_array, eye_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import csc_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from reenact.errors import ReenactError
 from reenact.geometry import closest_points_around, cotangent_laplacian, similarity_fit, vertex_areas, vertex_normals
+from reenact.retargeting.face import MOVING, STILL, Face
 from reenact.rigs import arkit
 from reenact.rigs.rig import Rig
 
-MOVING = 0.1
-"""A vertex belongs to the moving face where shapes move it by more than this share of how far they move anything,
-summed over shapes by squares."""
-
-_SURFACE_PARTS = ("skin", "lips", "brows")
-_MARGIN = 0.2
-"""Still skin around what moves that belongs to a face, in face heights: the other rig may move more."""
-STILL = 0.02
-"""A shape that moves the face by less than this share of the farthest moving one says nothing about it."""
 _FLOOR = 0.003
 """Share of a shape's farthest motion below which its logarithm flattens."""
 _DIMENSIONS = 140
 """Principal components that the motion of all shapes is reduced to."""
 _NORMAL_WEIGHT = 6.0
 """A turn by 10 degrees counts as much as one standard deviation of the position."""
+_RIM_WEIGHT = 3.0
+"""Standard deviations of the position that the rim of an eye or the mouth is apart from skin far from it."""
 _SCALES = (0.1, 0.2, 0.2, 0.2, 0.15, 0.1, 0.07, 0.05, 0.04, 0.03, 0.03, 0.02, 0.02, 0.015, 0.015)
 """Standard deviation of a partner's position, coarse to fine, in face heights."""
 _BELIEF = 1.5
@@ -88,83 +81,6 @@ class Registration:
     """How far off the partner is expected to lie, in face heights."""
     shape_pairs: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...]
     """Shapes of the source and of the target that were taken for the same."""
-
-
-@dataclass(frozen=True)
-class Face:
-    """The connected sheet of a rig that its shapes move, without eyes, teeth, tongue and lashes."""
-
-    vertices: Int[np.ndarray, "N"]
-    """Numbers in the rig."""
-    points: Float[np.ndarray, "N 3"]
-    normals: Float[np.ndarray, "N 3"]
-    areas: Float[np.ndarray, "N"]
-    """A third of the area around each vertex."""
-    faces: Int[np.ndarray, "M 3"]
-    """Of the sheet's own vertices."""
-    deltas: Float[np.ndarray, "K N 3"]
-    strength: Float[np.ndarray, "N"]
-    """Root of the summed squares of how far shapes move a vertex, each as a share of its farthest motion."""
-    height: float
-    """Of the moving face, brows to chin, metres."""
-
-    @classmethod
-    def of(cls, rig: Rig) -> Face:
-        """The face of a rig.
-
-        Raises:
-            ReenactError: Nothing moves.
-        """
-        points, faces = rig.neutral.double().cpu().numpy(), rig.faces.cpu().numpy()
-        deltas = rig.deltas.double().cpu().numpy()
-        motion = np.linalg.norm(deltas, axis=-1)  # (K, V)
-        farthest = motion.max(1, keepdims=True)
-        if farthest.max() <= 1e-9:
-            raise ReenactError(f"{rig.name}: expected shapes that move the face, got none; did the export keep them?")
-        live = farthest[:, 0] > STILL * farthest.max()
-        strength = np.sqrt(np.square(motion[live] / farthest[live]).sum(0))
-        sheet = _sheet(rig, points, faces, strength)
-        moving = sheet & (strength > MOVING)
-        if moving.sum() < 20:
-            raise ReenactError(
-                f"{rig.name}: expected a face that its shapes move, got {int(moving.sum())} connected vertices "
-                "that move; check the parts and the deltas"
-            )
-        low, high = (np.quantile(points[moving, 1], share) for share in (0.02, 0.98))
-        height = float(high - low)
-        near = cKDTree(points[moving]).query(points, distance_upper_bound=max(_MARGIN * height, 1e-9))[0] < np.inf
-        kept = faces[(sheet & near)[faces].all(1)]
-        vertices = np.unique(kept)
-        numbers = np.full(len(points), -1)
-        numbers[vertices] = np.arange(len(vertices))
-        own_faces, own_points = numbers[kept], points[vertices]
-        normals = vertex_normals(torch.from_numpy(own_points), torch.from_numpy(own_faces)).numpy()
-        return cls(
-            vertices,
-            own_points,
-            normals,
-            vertex_areas(own_points, own_faces),
-            own_faces,
-            np.ascontiguousarray(deltas[:, vertices]),
-            strength[vertices],
-            height,
-        )
-
-
-def _sheet(rig: Rig, points: np.ndarray, faces: np.ndarray, strength: np.ndarray) -> np.ndarray:
-    """Marks the connected sheet with the largest moved area; vertices at one place count as connected."""
-    marked = np.ones(len(points), bool)
-    if len(rig.part(*_SURFACE_PARTS)):
-        marked = np.zeros(len(points), bool)
-        marked[rig.part(*_SURFACE_PARTS).cpu().numpy()] = True
-    kept = faces[marked[faces].all(1)]
-    _, place = np.unique(points.round(7), axis=0, return_inverse=True)
-    ends = place[kept[:, [0, 1, 2]]].ravel(), place[kept[:, [1, 2, 0]]].ravel()
-    count = int(place.max()) + 1
-    _, piece = connected_components(coo_array((np.ones(len(ends[0])), ends), shape=(count, count)), directed=False)
-    piece = piece[place]
-    moved_area = np.bincount(piece, weights=vertex_areas(points, kept) * strength)
-    return marked & (piece == moved_area.argmax())
 
 
 # ---- which shape is which ----
@@ -299,7 +215,7 @@ def register(source: Rig, target: Rig, use_names: bool = True) -> Registration:
     Raises:
         ReenactError: A rig does not move, or no four shapes of both move the face alike.
     """
-    faces = Face.of(source), Face.of(target)
+    faces = _comparable(source, target)
     pairs = _moving(*faces, pairs_by_name(source.names, target.names)) if use_names else ()
     if len(pairs) < 4:
         pairs = _moving(*faces, _pairs_by_habit(*faces, _boxes_aligned(*faces)))
@@ -322,6 +238,14 @@ def register(source: Rig, target: Rig, use_names: bool = True) -> Registration:
     return Registration(
         faces[0].vertices[moving], faces[1].vertices[corners[moving]], shares[moving], error[moving], pairs
     )
+
+
+def _comparable(source: Rig, target: Rig) -> tuple[Face, Face]:
+    """Faces of two rigs, without sockets where only one has them: these find no partner, and drag the lids along."""
+    faces = Face.of(source), Face.of(target)
+    if faces[0].hollow.any() == faces[1].hollow.any():
+        return faces
+    return faces[0].without_hollows(), faces[1].without_hollows()
 
 
 def _need(source: Rig, target: Rig, pairs: Pairs) -> None:
@@ -415,7 +339,7 @@ def complete(
     Raises:
         ReenactError: A landmark does not lie on the face, or all lie on one line.
     """
-    faces = Face.of(source), Face.of(target)
+    faces = _comparable(source, target)
     own = [
         _own(rig, face, given) for rig, face, given in zip((source, target), faces, (source_vertices, target_vertices))
     ]
@@ -435,13 +359,13 @@ def complete(
     points = rest + smooth(offsets, weights, 1e-3 * _BENDING[1])
     for size in (0.1, 0.1, 0.07, 0.05, 0.03):
         normals = _normals(points, faces[0].faces)
-        match = search(points, normals, still[0], size, metric)
+        match = search(points, _looks(normals, faces[0].rim), still[0], size, metric)
         facing = (match.of(faces[1].normals) * normals).sum(1)
         usual = max(1.5 * float(np.median(match.distance)), 1e-9)
         trust = 0.3 * (facing > 0.5) / (1 + np.square(match.distance / usual))
         pull = np.where(weights[:, None] > 0, offsets, match.of(faces[1].points) - rest)
         points = rest + smooth(pull, np.where(weights > 0, weights, trust), _BENDING[1] * size**2)
-    match = search(points, _normals(points, faces[0].faces), still[0], 0.03, metric)
+    match = search(points, _looks(_normals(points, faces[0].faces), faces[0].rim), still[0], 0.03, metric)
     corners, shares = match.corners, match.shares
     corners[own[0]], shares[own[0]] = own[1][:, None], [1.0, 0.0, 0.0]
     slack = np.linalg.norm(match.of(faces[1].points) - points, axis=1) / faces[1].height
@@ -501,7 +425,7 @@ def _match(
     moved = source.areas * np.minimum(1, source.strength)
     spread = float(moved @ np.square(ours - np.average(ours, axis=0, weights=moved)).sum(1) / moved.sum())
     for step, scale in enumerate(scales):
-        match = search(points, normals, ours, scale, metric)
+        match = search(points, _looks(normals, source.rim), ours, scale, metric)
         features = match.of(theirs)
         facing = (match.of(target.normals) * normals).sum(1)
         usual = max(1.5 * float(np.median(match.distance)), 1e-9)
@@ -511,27 +435,31 @@ def _match(
         normals = _normals(points, source.faces)
         ours = original + smooth(features - original, trust, _FEATURE_BENDING)
         metric = _metric(ours - features, trust * source.areas, spread)
-    match = search(points, normals, ours, scales[-1], metric)
-    sharpness = _sharpness(target, np.concatenate([target.normals * _NORMAL_WEIGHT, theirs @ metric], 1))
+    match = search(points, _looks(normals, source.rim), ours, scales[-1], metric)
+    sharpness = _sharpness(target, np.concatenate([search.looks, theirs @ metric], 1))
     return replace(match, slide=match.distance / match.of(sharpness[:, None])[:, 0].clip(1))
 
 
 class _Search:
-    """Closest points of the target's surface in the space of positions, normals and motion."""
+    """Closest points of the target's surface in the space of positions, looks and motion."""
 
     def __init__(self, target: Face, features: np.ndarray) -> None:
-        self.target, self.features = target, features
+        self.target, self.features, self.looks = target, features, _looks(target.normals, target.rim)
 
     def __call__(
-        self, points: np.ndarray, normals: np.ndarray, features: np.ndarray, scale: float, metric: np.ndarray
+        self, points: np.ndarray, looks: np.ndarray, features: np.ndarray, scale: float, metric: np.ndarray
     ) -> _Match:
         target, unit = self.target, scale * self.target.height
-        look = np.concatenate([target.normals * _NORMAL_WEIGHT, self.features @ metric], 1)
-        places = np.concatenate([target.points / unit, look], 1)
-        queries = np.concatenate([points / unit, normals * _NORMAL_WEIGHT, features @ metric], 1)
+        places = np.concatenate([target.points / unit, self.looks, self.features @ metric], 1)
+        queries = np.concatenate([points / unit, looks, features @ metric], 1)
         corners, shares = _closest(queries, places, target.faces)
         offsets = np.einsum("nci,nc->ni", places[corners], shares) - queries
         return _Match(corners, shares, np.linalg.norm(offsets, axis=1), np.zeros(len(queries)))
+
+
+def _looks(normals: Float[np.ndarray, "N 3"], rim: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N 4"]:
+    """What a place looks like at rest, beside where it is."""
+    return np.concatenate([_NORMAL_WEIGHT * normals, _RIM_WEIGHT * rim[:, None]], 1)
 
 
 def _closest(queries: np.ndarray, places: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

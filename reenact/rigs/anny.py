@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from reenact.errors import ReenactError
+from reenact.geometry import boundary_edges
 from reenact.rigs import head as heads
 from reenact.rigs import makehuman
 from reenact.rigs.personalise import LocalField, Transfer, affine_map, close_pairs, rigid_rotation
@@ -477,7 +478,7 @@ def _tuck_lining(head: heads.Head, neutral: np.ndarray) -> np.ndarray:
 
 def _flatten_rim(skin: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Puts the open border of the neck, which shape targets have bent, back onto a plane and eases what is above."""
-    rim = np.unique(heads.boundary_edges(faces))
+    rim = np.unique(boundary_edges(faces))
     system = np.stack([np.ones(len(rim)), skin[rim, 2]], axis=1)
     correction = system @ np.linalg.lstsq(system, skin[rim, 1], rcond=None)[0] - skin[rim, 1]
     near = np.flatnonzero(skin[:, 1] < skin[rim, 1].max() + 0.03)

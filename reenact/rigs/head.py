@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.interpolate import PchipInterpolator
 
+from reenact.geometry import boundary_edges
 from reenact.rigs import makehuman
 
 REFERENCE = {
@@ -110,13 +111,6 @@ def load_head() -> Head:
         lids=lids,
         lips=_lip_pairs(reference, makehuman.read_target("faceunits01/targets/faceunits/jawOpen")[coarse]),
     )
-
-
-def boundary_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "E 2"]:
-    """Edges with one face only."""
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
-    return unique[count == 1]
 
 
 def fit_eyeball(vertices: Float[np.ndarray, "V 3"], side: str) -> tuple[Float[np.ndarray, "3"], float]:
