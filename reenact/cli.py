@@ -599,6 +599,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except ReenactError as error:
             _say(console, "red", "error", str(error))
             return 2
+        except BrokenPipeError:  # whoever read our words has gone, as `head` does
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
+            return 141  # what shells say of those that a closed pipe ends
         except OSError as error:  # a file that is missing or forbidden, a full disk
             where = f"{error.filename}: " if error.filename else ""
             remedy = _REMEDIES.get(error.errno or 0, "")

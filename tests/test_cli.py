@@ -419,6 +419,14 @@ def test_idle_threads_sleep_unless_the_user_says_otherwise(given, policy):
     assert done.stdout.strip() == policy
 
 
+def test_a_reader_that_has_gone_is_no_error():
+    command = [sys.executable, "-m", "reenact", "train", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        running.stdout.close()
+        assert running.stderr.read() == ""
+    assert running.returncode == 141
+
+
 def test_a_rate_that_is_asked_for_is_said_and_a_result_is_finished_as_asked(tmp_path, capsys, toy_rig):
     save_rig(toy_rig, tmp_path / "ball.npz")
     arguments = ["convert", "synthetic:3:2", f"{tmp_path / 'c.npz'}", "--rig", f"{tmp_path / 'ball.npz'}"]

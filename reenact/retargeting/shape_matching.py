@@ -166,9 +166,9 @@ def find_partners(
 
     A row is a sum of two of the other side where it looks like that by `sum_similarity`, and `sum_gain` more than like
     any single one, unless one of the two has a better home. What looks like a sum, and is none, has no partner either
-    if no single one is `sure`. Cosines of a second kind, `likeness`, count as much. (Of a man
-    and ICT FaceKit 49 and 47 single partners are right so, 1 and 2 wrong; 45 and 45, 5 and 2 by the rows alone. With
-    half or twice the share nothing changes.)
+    if no single one is `sure`. Cosines of a second kind, `likeness`, count as much. (From a man to ICT FaceKit and
+    back, by all places that move, 50 and 50 single partners are right so and none is wrong; 46 and 50, 4 and none by
+    the rows alone.)
     """
     cosines = _unit(ours) @ _unit(theirs).T
     merged, doubtful = _sums(theirs, ours, cosines.T, config)
