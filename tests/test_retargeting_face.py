@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from reenact.geometry import edge_graph, mesh_edges, nearest_along
 from reenact.retargeting.correspondence import find_correspondence
@@ -93,6 +94,26 @@ def test_eyeballs_hide_the_sockets(man):
     blind = without_faces(man, man.part("eyes").numpy())
     assert seen_from_outside(man, middle, face.height)[hollow].mean() < 0.02
     assert seen_from_outside(blind, middle, face.height)[hollow].mean() > 0.1
+
+
+def test_a_head_in_a_box_has_no_hollows(man):
+    low, high = man.neutral.amin(0) - 0.01, man.neutral.amax(0) + 0.01
+    box = trimesh.creation.box(bounds=np.stack([low, high]))
+    walls = torch.from_numpy(box.vertices).float()
+    hidden = replace(
+        man,
+        neutral=torch.cat([man.neutral, walls]),
+        deltas=torch.cat([man.deltas, torch.zeros(len(man.names), len(walls), 3)], 1),
+        faces=torch.cat([man.faces, torch.from_numpy(box.faces) + len(man.neutral)]),
+        parts=torch.cat([man.parts, torch.zeros(len(walls)).to(man.parts)]),
+        colors=None,
+        uv=None,
+        uv_faces=None,
+        texture=None,
+    )
+    face = Face.of(hidden)
+    assert not face.hollow.any()
+    np.testing.assert_array_equal(face.vertices, Face.of(man).vertices)
 
 
 def test_lids_find_their_partners_where_only_one_head_has_sockets(man):

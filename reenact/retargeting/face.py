@@ -173,6 +173,8 @@ def seen_from_outside(rig: Rig, middle: Float[np.ndarray, "3"], height: float) -
 
 def _hollow(points: np.ndarray, faces: np.ndarray, seen: np.ndarray, height: float) -> Bool[np.ndarray, "N"]:
     """Connected skin out of sight that reaches deep."""
+    if not seen.any():  # a head that looks away, or in a box
+        return np.zeros(len(points), bool)
     depth = nearest_along(edge_graph(points, mesh_edges(faces)), np.flatnonzero(seen))[1]
     edges = mesh_edges(faces[~seen[faces].any(1)])
     count = len(points)
