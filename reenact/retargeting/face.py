@@ -1,7 +1,8 @@
 """The face of a rig: the one connected sheet that its shapes move, skin and lips, and the rims of its openings. Ours.
 
 Some heads end at the lid's margin, and others have skin in the socket behind it. What lies there has no partner on a
-head without; the margin has one on both.
+head without; the margin has one on both. What is out of sight is told by the renderer, the only use that geometric
+methods make of it: any mesh that it draws has insides, closed or not, and its depth is exact.
 """
 
 from __future__ import annotations
