@@ -122,6 +122,13 @@ def boundary_edges(faces: Int[np.ndarray, "F 3"]) -> Int[np.ndarray, "E 2"]:
     return unique[count == 1]
 
 
+def connected_pieces(faces: Int[np.ndarray, "F 3"], count: int) -> Int[np.ndarray, "V"]:
+    """The number of the connected piece that each of `count` vertices belongs to; those without a face are alone."""
+    pairs = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    graph = sparse.coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
 def outward_faces(
     points: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], open_share: float = 0.05
 ) -> Bool[np.ndarray, "F"]:

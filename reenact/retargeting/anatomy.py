@@ -34,6 +34,7 @@ from reenact.errors import ReenactError
 from reenact.geometry import (
     boundary_edges,
     closest_points_around,
+    connected_pieces,
     cotangent_laplacian,
     face_areas,
     farthest_points,
@@ -43,7 +44,7 @@ from reenact.geometry import (
     vertex_normals,
 )
 from reenact.retargeting.correspondence import Correspondence
-from reenact.retargeting.deformation_transfer import connected_pieces, vertex_pairs
+from reenact.retargeting.deformation_transfer import vertex_pairs
 from reenact.retargeting.face import Face
 from reenact.retargeting.landmarks import (
     Contact,

@@ -22,7 +22,6 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.sparse import coo_array, csr_array, diags_array, sparray
-from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial import cKDTree
 from torch import Tensor
@@ -30,6 +29,7 @@ from torch import Tensor
 from reenact.errors import ReenactError
 from reenact.geometry import (
     closest_points,
+    connected_pieces,
     deformation_gradients,
     edge_graph,
     face_areas,
@@ -202,13 +202,6 @@ class GradientSolver:
         offsets = np.zeros((self._weighted.shape[0], 3 * frames))
         offsets[self._free] = self._factor.solve((self._weighted @ wanted)[self._free])
         return torch.from_numpy(offsets).unflatten(1, (frames, 3)).transpose(0, 1)
-
-
-def connected_pieces(faces: ndarray, count: int) -> ndarray:
-    """The number of the connected piece that each vertex belongs to."""
-    pairs = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
 
 
 class Anchors:

@@ -23,12 +23,11 @@ from jaxtyping import Float
 from scipy.sparse import coo_array, csr_array
 from torch import Tensor
 
-from reenact.geometry import similarity_fit, vertex_normals
+from reenact.geometry import connected_pieces, similarity_fit, vertex_normals
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import (
     Explanation,
     apply_sparse,
-    connected_pieces,
     densify,
     vertex_pairs,
 )

@@ -18,7 +18,15 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from reenact.errors import ReenactError
-from reenact.geometry import boundary_edges, edge_graph, mesh_edges, nearest_along, vertex_areas, vertex_normals
+from reenact.geometry import (
+    boundary_edges,
+    connected_pieces,
+    edge_graph,
+    mesh_edges,
+    nearest_along,
+    vertex_areas,
+    vertex_normals,
+)
 from reenact.rigs.rig import Rig
 from render.camera import Camera, to_pixels
 from render.pipeline import render
@@ -102,7 +110,7 @@ class Face:
         return cls(
             vertices,
             shown,
-            _normals(shown, own),
+            surface_normals(shown, own),
             vertex_areas(shown, own),
             own,
             np.ascontiguousarray(deltas[:, vertices]),
@@ -120,7 +128,7 @@ class Face:
             self,
             vertices=self.vertices[kept],
             points=shown,
-            normals=_normals(shown, own),
+            normals=surface_normals(shown, own),
             areas=vertex_areas(shown, own),
             faces=own,
             deltas=np.ascontiguousarray(self.deltas[:, kept]),
@@ -177,9 +185,8 @@ def _hollow(points: np.ndarray, faces: np.ndarray, seen: np.ndarray, height: flo
     if not seen.any():  # a head that looks away, or in a box
         return np.zeros(len(points), bool)
     depth = nearest_along(edge_graph(points, mesh_edges(faces)), np.flatnonzero(seen))[1]
-    edges = mesh_edges(faces[~seen[faces].any(1)])
     count = len(points)
-    pieces = connected_components(coo_array((np.ones(len(edges)), edges.T), shape=(count, count)), directed=False)[1]
+    pieces = connected_pieces(faces[~seen[faces].any(1)], count)
     deepest = np.zeros(count)
     np.maximum.at(deepest, pieces, np.where(seen | np.isinf(depth), 0, depth))
     return ~seen & (deepest[pieces] > _DEEP * height)
@@ -197,5 +204,6 @@ def _rim(
     return np.exp(-distance / max(_RIM * height, 1e-12))
 
 
-def _normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def surface_normals(points: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, "M 3"]) -> Float[np.ndarray, "N 3"]:
+    """`vertex_normals` of arrays: unit length."""
     return vertex_normals(torch.from_numpy(points), torch.from_numpy(faces)).numpy()

@@ -12,8 +12,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from reenact.geometry import edge_graph, mesh_edges, nearest_along, rigid_fit
-from reenact.retargeting.deformation_transfer import connected_pieces
+from reenact.geometry import connected_pieces, edge_graph, mesh_edges, nearest_along, rigid_fit
 from reenact.retargeting.face import Face
 from reenact.rigs.rig import Rig
 

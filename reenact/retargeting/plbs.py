@@ -39,9 +39,9 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from reenact.errors import ReenactError
-from reenact.geometry import edge_graph, farthest_points, mesh_edges, nearest_along
+from reenact.geometry import connected_pieces, edge_graph, farthest_points, mesh_edges, nearest_along
 from reenact.retargeting.correspondence import Correspondence
-from reenact.retargeting.deformation_transfer import apply_sparse, connected_pieces, densify, vertex_pairs
+from reenact.retargeting.deformation_transfer import apply_sparse, densify, vertex_pairs
 from reenact.rigs.rig import Rig
 
 try:

@@ -31,8 +31,8 @@ from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
 from reenact.errors import ReenactError
-from reenact.geometry import closest_points_around, cotangent_laplacian, similarity_fit, vertex_areas, vertex_normals
-from reenact.retargeting.face import MOVING, STILL, Face
+from reenact.geometry import closest_points_around, cotangent_laplacian, similarity_fit, vertex_areas
+from reenact.retargeting.face import MOVING, STILL, Face, surface_normals
 from reenact.rigs import arkit
 from reenact.rigs.rig import Rig
 
@@ -233,7 +233,7 @@ def register(source: Rig, target: Rig, use_names: bool = True) -> Registration:
     rest = start(faces[0].points)
     trust = np.minimum(np.square(0.01 / error), 10)
     settled = rest + _Smoother(faces[0])(partners - rest, trust, _SETTLING)  # the sure places hold the others
-    corners, shares = _onto(faces[1], settled, _normals(settled, faces[0].faces))
+    corners, shares = _onto(faces[1], settled, surface_normals(settled, faces[0].faces))
     moving = np.flatnonzero(faces[0].strength > MOVING)
     return Registration(
         faces[0].vertices[moving], faces[1].vertices[corners[moving]], shares[moving], error[moving], pairs
@@ -358,14 +358,14 @@ def complete(
     offsets[own[0]] = given[1] - rest[own[0]]
     points = rest + smooth(offsets, weights, 1e-3 * _BENDING[1])
     for size in (0.1, 0.1, 0.07, 0.05, 0.03):
-        normals = _normals(points, faces[0].faces)
+        normals = surface_normals(points, faces[0].faces)
         match = search(points, _looks(normals, faces[0].rim), still[0], size, metric)
         facing = (match.of(faces[1].normals) * normals).sum(1)
         usual = max(1.5 * float(np.median(match.distance)), 1e-9)
         trust = 0.3 * (facing > 0.5) / (1 + np.square(match.distance / usual))
         pull = np.where(weights[:, None] > 0, offsets, match.of(faces[1].points) - rest)
         points = rest + smooth(pull, np.where(weights > 0, weights, trust), _BENDING[1] * size**2)
-    match = search(points, _looks(_normals(points, faces[0].faces), faces[0].rim), still[0], 0.03, metric)
+    match = search(points, _looks(surface_normals(points, faces[0].faces), faces[0].rim), still[0], 0.03, metric)
     corners, shares = match.corners, match.shares
     corners[own[0]], shares[own[0]] = own[1][:, None], [1.0, 0.0, 0.0]
     slack = np.linalg.norm(match.of(faces[1].points) - points, axis=1) / faces[1].height
@@ -432,7 +432,7 @@ def _match(
         trust = (facing > 0.2) / (1 + np.square(match.distance / usual))
         stiffness = bending[0] * (bending[1] / bending[0]) ** (step / (len(scales) - 1))
         points = rest + smooth(match.of(target.points) - rest, trust, stiffness * scale**2)
-        normals = _normals(points, source.faces)
+        normals = surface_normals(points, source.faces)
         ours = original + smooth(features - original, trust, _FEATURE_BENDING)
         metric = _metric(ours - features, trust * source.areas, spread)
     match = search(points, _looks(normals, source.rim), ours, scales[-1], metric)
@@ -499,10 +499,6 @@ class _Smoother:
         return splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).solve(
             weights[:, None] * data
         )
-
-
-def _normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    return vertex_normals(torch.from_numpy(points), torch.from_numpy(faces)).numpy()
 
 
 def _metric(difference: Float[np.ndarray, "N D"], weights: Float[np.ndarray, "N"], spread: float) -> np.ndarray:
