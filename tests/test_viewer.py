@@ -643,7 +643,8 @@ class Opened:
 
     def faces(self) -> np.ndarray:
         """What the canvas shows, (H, W, 3), once it stands still."""
-        self.page.wait_for_timeout(400)
+        self.page.wait_for_timeout(100)  # a page that loads something asks for its drawing a little later
+        self.wait("viewer.still")
         return np.asarray(Image.open(BytesIO(self.page.locator("#stage").screenshot())).convert("RGB")).astype(float)
 
     def frame(self) -> int:

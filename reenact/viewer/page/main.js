@@ -301,6 +301,7 @@ function tick() {
   if (state.frame === before && !dirty) return; // a screen is faster than most clips
   dirty = false;
   clearTimeout(settling);
+  settling = 0;
   stage.setDetail(state.playing ? DETAIL.playing : DETAIL.moving);
   draw();
   if (state.playing) countFrame();
@@ -308,6 +309,7 @@ function tick() {
 }
 
 function settle() {
+  settling = 0;
   stage.setDetail(DETAIL.still);
   draw();
 }
@@ -766,6 +768,9 @@ window.viewer = {
   software: stage.software,
   get idle() {
     return [...tracks.values()].every((track) => track.whole || track.failed) && !follower.busy;
+  },
+  get still() {
+    return !state.playing && !asked && !dirty && !settling;
   },
   measure(count = 60) {
     const from = state.frame;
