@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from reenact.config import BPNetConfig, Config, ReenactNetConfig, TrainingConfig
+from reenact.config import BPNetConfig, Config, ImageConfig, ReenactNetConfig, TrainingConfig
 from reenact.errors import ReenactError
 from reenact.evaluation import vertex_error_ratio
 from reenact.inference import ImageRetargeter
@@ -42,6 +42,7 @@ def main() -> None:
     arguments.folder.mkdir(parents=True, exist_ok=True)
     first, *others = arguments.cast
     settings = Config(
+        images=ImageConfig(supersample=1),
         reenactnet=ReenactNetConfig(components=256, width=256, code=128, color_components=64),
         bpnet=BPNetConfig(hidden=256),
         training=TrainingConfig(

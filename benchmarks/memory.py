@@ -90,7 +90,7 @@ def trained(case: dict[str, int], method: str, large: bool) -> dict[str, float]:
             source=str(paths[0]),
             target=str(paths[1]),
             run=f"{folder}/run",
-            images=ImageConfig(resolution=case["resolution"]),
+            images=ImageConfig(resolution=case["resolution"], supersample=1),
             pairs=PairsConfig(method=method),
             reenactnet=reenactnet,
             bpnet=bpnet,

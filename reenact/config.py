@@ -22,7 +22,7 @@ class ImageConfig:
 
     resolution: int = 64
     """Height and width in pixels; a multiple of 16."""
-    supersample: int = 1
+    supersample: int = 2
     """Render this many times larger and average: smoother colours, at the square of the cost."""
     makeup: bool = True
     """Paint lips, brows, skin and teeth of every rig alike for the networks, where the rig tells its parts."""
@@ -88,7 +88,7 @@ class ReenactNetConfig:
     family."""
     code: int = 256
     """Size of the bottleneck. Far larger ones let identity leak into the code."""
-    components: int = 512
+    components: int = 768
     """Principal components of what is read from a rig's pictures."""
     color_components: int = 128
     """Principal components of the colours that are drawn beside the motion pass."""
@@ -117,6 +117,9 @@ class BPNetConfig:
     """Convolutional: channels after the first convolution."""
     hidden: int = 512
     """Width of the hidden dense layers; 0 reads by a straight map."""
+    bounded: bool = True
+    """Answers beyond [0, 1] hardly count, so that any number below zero says that a shape rests. Without it they are
+    clamped only at inference, as published."""
     epochs: float | None = None
     """Passes over the `training.frames` pictures, where they are never refreshed; None counts in `steps`."""
     steps: int = 3000
@@ -136,7 +139,7 @@ class BPNetConfig:
     decoded_fraction: float = 0.5
     """Share of the pictures that ReenactNet draws first, as it will at inference: from the other rig's pictures where
     there are pairs, else from the rig's own."""
-    image_fraction: float = 0.25
+    image_fraction: float = 0.0625
     """Share of the pictures whose predicted weights are rendered again for L_r, which costs more than all the rest."""
 
 
@@ -178,8 +181,10 @@ class TrainingConfig:
     Helps where no pairs teach it to overlook how faces differ."""
     motion_weighting: bool = True
     """Convolutional: weight the reconstruction by where each rig's pictures move."""
-    crowded: float = 0.3
+    crowded: float = 0.6
     """Share of random expressions that move any number of shapes, up to all, more weakly, as recorded faces do."""
+    uneven: float = 0.5
+    """Share of those in which most shapes move hardly and a few as far as they can."""
     frames: int = 6144
     """Rendered expressions of each rig that are in memory at a time."""
     refresh: int = 2500
@@ -443,6 +448,7 @@ _ALLOWED: dict[str, _Rule] = {
     "training.align_loss": _NOT_NEGATIVE,
     "training.cycle_loss": _NOT_NEGATIVE,
     "training.crowded": _FRACTION,
+    "training.uneven": _FRACTION,
     "training.frames": ("a whole number from 8 to 1,000,000", lambda value: 8 <= value <= 1_000_000),
     "training.refresh": ("a whole number of at least 0", lambda value: value >= 0),
     "training.seed": ("a whole number from 0 to 2^63 - 1", lambda value: 0 <= value < 2**63),

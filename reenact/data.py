@@ -53,6 +53,7 @@ class Studio:
         clip: Clip | None = None,
         seed: int = 0,
         crowded: float = 0.0,
+        uneven: float = 0.0,
         device: str = "cpu",
     ):
         """
@@ -65,12 +66,13 @@ class Studio:
             clip: Training motion with the rig's names; None samples random valid expressions without end.
             seed: Of the survey.
             crowded: Share of random expressions that move any number of shapes; see `motion.expressions`.
+            uneven: Share of those whose shapes differ in strength.
             device: Where pictures are made and stay. Weights come from anywhere, and are drawn on the CPU.
 
         Raises:
             ReenactError: The rig has no eyes above a mouth, or its pictures do not change.
         """
-        self.seed, self.crowded = seed, crowded
+        self.seed, self.crowded, self.uneven = seed, crowded, uneven
         self.rig, self.resolution, self.residual = rig, config.resolution, config.residual
         self.buffers = ("color", "motion") if config.motion else ("color",)
         self.rendered_at = config.supersample * config.resolution
@@ -93,8 +95,12 @@ class Studio:
     def draw(self, count: int, random: np.random.Generator) -> Float[Tensor, "N K"]:
         """Weights of training expressions: from the clip if there is one, else fresh."""
         if self.pool is None:
-            return motion.expressions(self.rig.names, count, random, self.crowded)
+            return self.random(count, random)
         return self.pool[random.integers(len(self.pool), size=count)]
+
+    def random(self, count: int, random: np.random.Generator) -> Float[Tensor, "N K"]:
+        """Weights of random expressions, as many of them crowded as the settings say."""
+        return motion.expressions(self.rig.names, count, random, self.crowded, self.uneven)
 
     def surveyed(self, count: int) -> Float[Tensor, "N K"]:
         """That many training expressions, always the same ones."""
@@ -126,7 +132,7 @@ class Studio:
         if self.layout is not None:  # beyond the picture lies background, which only colours have
             beyond = torch.cat([_beyond(name, rendered[name].shape[1]) for name in buffers])[:, None, None].to(picture)
             picture = warp(picture - beyond, self.layout, "zeros") + beyond
-        return F.adaptive_avg_pool2d(picture, self.resolution)
+        return _shrunk(picture, self.rendered_at // self.resolution)
 
     def glance(self, weights: Float[Tensor, "N K"]) -> Float[Tensor, "N 3 R R"]:
         """What networks are shown of the buffer that they read from, without the cost of the others."""
@@ -153,6 +159,16 @@ class Studio:
         """The pictures behind what a network drew: the inverse of `show`, with colours clamped to [0, 1]."""
         pictures = shown * self.contrast + self.neutral if self.residual else shown
         return torch.cat([pictures[:, :3].clamp(0, 1), pictures[:, 3:]], dim=1)
+
+
+def _shrunk(pictures: Float[Tensor, "N C H W"], factor: int) -> Float[Tensor, "N C h w"]:
+    """Means of squares of so many pixels a side.
+
+    In sums that are too small to be shared among threads where there is one picture: PyTorch's pooling wakes its threads
+    for it, which then fight with the renderer's for the cores, a frame of 8 ms taking 30.
+    """
+    rows = sum(pictures[:, :, start::factor] for start in range(factor))
+    return sum(rows[..., start::factor] for start in range(factor)) / factor**2
 
 
 def _beyond(buffer: str, channels: int) -> Float[Tensor, "C"]:

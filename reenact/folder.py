@@ -1,6 +1,6 @@
 """The format of a run folder, and the settings in it, whatever version of Reenact wrote them.
 
-format.json          {"format": 1, "reenact": "0.2.0"}: the layout of the folder, and the version that made it so
+format.json          {"format": 2, "reenact": "0.2.0"}: the layout of the folder, and the version that made it so
 
 The format counts changes after which older code would misread a folder, or newer code an older folder. A folder of an
 older format is read as one of today's by the steps below, in memory; a run that is trained on is also rewritten, under
@@ -23,7 +23,7 @@ from reenact.atomic import write_atomically
 from reenact.config import Config, check_config, config_from_dict, read_table, save_config
 from reenact.errors import MissingError, ReenactError
 
-FORMAT = 1
+FORMAT = 2
 """Of the folders that this version writes."""
 
 
@@ -122,5 +122,14 @@ def _from_0(table: dict[str, Any], folder: Path) -> dict[str, Any]:
     return {**table, "training": {"together": False, **training}}  # stages, where the setting was not known yet
 
 
-_STEPS: dict[int, Callable[[dict[str, Any], Path], dict[str, Any]]] = {0: _from_0}
+def _from_1(table: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Before BPNet's answers were bounded, and crowded expressions uneven."""
+    for name, added in (("bpnet", {"bounded": False}), ("training", {"uneven": 0.0})):
+        section = table.get(name, {})
+        if isinstance(section, dict):  # what is not is refused later
+            table = {**table, name: {**added, **section}}
+    return table
+
+
+_STEPS: dict[int, Callable[[dict[str, Any], Path], dict[str, Any]]] = {0: _from_0, 1: _from_1}
 """By format: its settings as those of the next format."""

@@ -24,7 +24,6 @@ from reenact.data import Studio
 from reenact.losses import VertexDistance
 from reenact.models import Networks
 from reenact.pairs import LEAST_TRUST, Teacher
-from reenact.rigs import motion
 
 NUMBER, OWN = "held_out", "held_out_own"
 """Of `Holdout`: the number, and by rig as `held_out.KEY`; by rig from its own pictures as `held_out_own.KEY`."""
@@ -82,7 +81,7 @@ class Holdout:
         self.directions: list[_Direction] = []
         for place, (key, studio) in enumerate(studios.items()):
             random = np.random.default_rng([seed, 0, 0, place, _APART])
-            weights = motion.expressions(studio.rig.names, count, random, studio.crowded)
+            weights = studio.random(count, random)
             seen = torch.cat([net.readable(net.describe(key, studio.glance(chunk))) for chunk in weights.split(_CHUNK)])
             if key in learning:
                 even = seen.new_full((count,), 1 / count)

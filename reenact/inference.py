@@ -79,7 +79,7 @@ class ImageRetargeter:
         keys = keys[::-1] if reverse else keys
         saved = load_checkpoint(run.folder, checkpoint)
         older = saved.step if checkpoint != "newest" and saved.step != newest_step(run.folder) else None
-        networks = run.trained_networks(saved).to(device)
+        networks = run.trained_networks(saved).to(device).freeze()
         return cls(run, run.studio(keys[0], device), run.studio(keys[1], device), networks, keys, older)
 
     @torch.inference_mode()

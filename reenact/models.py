@@ -28,6 +28,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import pairwise
 
+import scipy.linalg
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
@@ -38,6 +39,10 @@ from reenact.config import BPNetConfig, Config, ReenactNetConfig
 
 READ = 3
 """Channels that are read from, the last ones of a picture: its motion pass, or its colours if it has no other."""
+PICTURES_PER_COMPONENT = 6
+"""Pictures of a rig, per principal component, that its components are taken from."""
+_LEAK = 0.01
+"""What of a number beyond [0, 1] is left by a `LeakyClamp`."""
 _SPREAD = 4.0
 """Standard deviation of the strongest component in a description; activations of that size train well."""
 _COLUMNS = 8192
@@ -66,10 +71,23 @@ class Eigenpictures(nn.Module):
         self.register_buffer("components", torch.zeros(count, size))
         self.register_buffer("unit", torch.ones(()))
         self.register_buffer("importance", torch.zeros(count))
+        self._varying: tuple[Tensor, ...] | None = None
 
     def describe(self, shown: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B N"]:
         """The mixture that comes closest to each picture."""
-        return (shown.flatten(1) * self.weight - self.mean) @ self.components.T / self.unit
+        flat, weight, mean, components = shown.flatten(1), self.weight, self.mean, self.components
+        if self._varying is not None:
+            places, weight, mean, components = self._varying
+            flat = flat[:, places]
+        return (flat * weight - mean) @ components.T / self.unit
+
+    def freeze(self) -> None:
+        """Describe faster from now on, for a basis that neither changes nor moves to another device any more.
+
+        What never varies says nothing of any component: half of a portrait's motion pass.
+        """
+        places = self.components.any(0).nonzero().flatten()
+        self._varying = places, self.weight[places], self.mean[places], self.components[:, places]
 
     def depict(self, mixtures: Float[Tensor, "B N"]) -> Float[Tensor, "B 3 R R"]:
         """The picture of each mixture."""
@@ -95,22 +113,23 @@ class Eigenpictures(nn.Module):
         flat -= self.mean
         parts = flat.split(_COLUMNS, dim=1)
         # Energies span six orders of magnitude, float32 sums would drown the last components.
-        gram = sum(part @ part.T for part in map(Tensor.double, parts))
-        values, vectors = torch.linalg.eigh(gram)  # of the small side, ascending
-        count = min(len(self.components), len(flat) - 1)
+        gram = sum(part @ part.T for part in map(Tensor.double, parts))  # of the small side
+        size, count = len(flat), min(len(self.components), len(flat) - 1)
+        strongest = scipy.linalg.eigh(gram.numpy(force=True), subset_by_index=[size - count, size - 1])  # ascending
+        values, vectors = (torch.from_numpy(each).to(gram) for each in strongest)
         values, vectors = values.flip(0).clamp_min(0), vectors.flip(1)
-        kept = values[:count] > 1e-9 * values[0]
-        turned = vectors[:, :count].T * kept[:, None]
+        kept = values > 1e-9 * values[0]
+        turned = vectors.T * kept[:, None]
         self.components.zero_()
         for rows, part in zip(self.components[:count].split(_COLUMNS, dim=1), parts):
             rows.copy_(turned @ part.double())  # U^T X: components times singular values
         self.components[:count] = F.normalize(self.components[:count], dim=1)
-        deviations = (values[:count] * kept / len(flat)).sqrt().float()
+        deviations = (values * kept / size).sqrt().float()
         self.unit.copy_(deviations[0] / _SPREAD)
         even = torch.where(kept, deviations.clamp_min(1e-12).rsqrt(), 0.0)  # 1 / sqrt: energies become deviations
         self.importance.zero_()
         self.importance[:count] = even * self.unit**2 / (even * deviations.square()).sum()
-        return float((values[:count] * kept).sum() / values.sum().clamp_min(1e-12))
+        return float((values * kept).sum() / gram.trace().clamp_min(1e-12))
 
 
 class ComponentReenactNet(nn.Module):
@@ -176,12 +195,11 @@ class ComponentReenactNet(nn.Module):
         energies, level = {}, []
         for key in keys:
             pictures = survey(key)
-            for basis, block in zip(self.bases[key], (pictures[:, -READ:], pictures[:, :READ])):
-                basis.fit(block, motion_weight(block))
+            self._fit_bases(key, pictures)
             read = pictures[:, -READ:]
             energies[key] = energy(read).flatten()
             level.append(read[: 2 * _COMMON // len(keys)] / energies[key].unflatten(0, read.shape[1:]))
-            del pictures, read, block  # before the next rig's come
+            del pictures, read  # before the next rig's come
         common = Eigenpictures(2 * self.count, level[0].shape[-1]).to(level[0].device)
         common.fit(torch.cat(level), common.weight.new_ones(1, common.resolution, common.resolution))
         for key in keys:
@@ -213,12 +231,16 @@ class ComponentReenactNet(nn.Module):
         tell = (seen.T @ torch.linalg.solve(gram, said - said_centre)).float()  # picture to mixture of what is shared
         for key in new:
             pictures = shown[key]
-            for basis, block in zip(self.bases[key], (pictures[:, -READ:], pictures[:, :READ])):
-                basis.fit(block, motion_weight(block))
+            self._fit_bases(key, pictures)
             basis = self.bases[key][0]
             place = basis.weight * energy(pictures[:, -READ:]).flatten()
             self.to_common[key].weight.copy_((basis.components * basis.unit / place) @ tell)
             self.to_common[key].bias.copy_((basis.mean / place - centre.float()) @ tell + said_centre.float())
+
+    def _fit_bases(self, key: str, pictures: Float[Tensor, "N C R R"]) -> None:
+        """Each basis of a rig takes its components from as many of the pictures as it needs."""
+        for basis, block in zip(self.bases[key], (pictures[:, -READ:], pictures[:, :READ])):
+            basis.fit(block[: PICTURES_PER_COMPONENT * len(basis.components)], motion_weight(block))
 
     def own(self, key: str) -> list[Tensor]:
         """What belongs to one rig and can be learnt; the encoder's first map of it is fitted otherwise."""
@@ -335,13 +357,26 @@ class Perceptron(nn.Module):
         return self.straight(x) + self.bent(x)
 
 
+class LeakyClamp(nn.Module):
+    """Of what a number exceeds [0, 1] by, where no weight is, only a hundredth is left. Ours.
+
+    A network can then say by any number below zero that a shape rests, and need not hit zero itself, which a smooth
+    function of a picture does badly; most shapes rest in most frames. A clamp would do the same, but what it cuts off
+    has no gradient and may never come back.
+    """
+
+    def forward(self, x: Float[Tensor, "B K"]) -> Float[Tensor, "B K"]:
+        return torch.lerp(x.clamp(0, 1), x, _LEAK)
+
+
 def component_bpnet(shape_count: int, components: int, config: BPNetConfig) -> nn.Module:
-    """Reads blendshape weights from a mixture of components: (B, M) -> (B, K), unbounded. Ours."""
-    return Perceptron(components, config.hidden, shape_count) if config.hidden else nn.Linear(components, shape_count)
+    """Reads blendshape weights from a mixture of components: (B, M) -> (B, K). Ours."""
+    net = Perceptron(components, config.hidden, shape_count) if config.hidden else nn.Linear(components, shape_count)
+    return nn.Sequential(net, LeakyClamp()) if config.bounded else net
 
 
 def convolutional_bpnet(shape_count: int, resolution: int, config: BPNetConfig) -> nn.Module:
-    """Reads blendshape weights from a picture: (B, 3, R, R) -> (B, K), unbounded: clamp at inference, not in training.
+    """Reads blendshape weights from a picture: (B, 3, R, R) -> (B, K).
 
     GroupNorm, since batches are small and drawn pictures differ from rendered ones.
     """
@@ -349,11 +384,11 @@ def convolutional_bpnet(shape_count: int, resolution: int, config: BPNetConfig) 
     blocks: list[nn.Module] = []
     for size_in, size_out in pairwise(sizes):
         blocks += [nn.Conv2d(size_in, size_out, 3, 2, 1), nn.GroupNorm(8, size_out), nn.SiLU()]
-    read = sizes[-1] * (resolution // 16) ** 2
-    if not config.hidden:
-        return nn.Sequential(*blocks, nn.Flatten(), nn.Linear(read, shape_count))
-    dense = [nn.Linear(read, config.hidden), nn.SiLU(), nn.Linear(config.hidden, shape_count)]
-    return nn.Sequential(*blocks, nn.Flatten(), *dense)
+    read, hidden = sizes[-1] * (resolution // 16) ** 2, config.hidden
+    dense: list[nn.Module] = [nn.Linear(read, shape_count)]
+    if hidden:
+        dense = [nn.Linear(read, hidden), nn.SiLU(), nn.Linear(hidden, shape_count)]
+    return nn.Sequential(*blocks, nn.Flatten(), *dense, *[LeakyClamp()] * config.bounded)
 
 
 class Networks(nn.Module):
@@ -398,12 +433,19 @@ class Networks(nn.Module):
         else:
             self.fit(new, shown.__getitem__)
 
+    def freeze(self) -> Networks:
+        """The networks themselves, faster, for use only: they must not learn, be loaded or moved any more."""
+        for module in self.modules():
+            if isinstance(module, Eigenpictures):
+                module.freeze()
+        return self.eval()
+
     def own(self, key: str) -> list[Tensor]:
         """What belongs to one rig alone and can be learnt: its part of ReenactNet, and its BPNet."""
         return [*self.reenactnet.own(key), *self.bpnets[key].parameters()]
 
     def retarget(self, shown: Float[Tensor, "B C R R"], source: str, target: str) -> Float[Tensor, "B K"]:
-        """The target's weights for pictures of the source, unbounded; colours may be left out where motion is shown."""
+        """The target's weights for pictures of the source, not clamped; colours may be left out beside motion."""
         net = self.reenactnet
         drawn = net(net.readable(net.describe(source, shown)), source, target)
         return self.bpnets[target](net.readable(drawn))
@@ -414,7 +456,7 @@ class Networks(nn.Module):
         return net.depict(target, net(net.readable(net.describe(source, shown)), source, target))
 
     def read(self, shown: Float[Tensor, "B C R R"], key: str) -> Float[Tensor, "B K"]:
-        """Weights of a rig from its own pictures, unbounded."""
+        """Weights of a rig from its own pictures, not clamped."""
         net = self.reenactnet
         return self.bpnets[key](net.readable(net.describe(key, shown)))
 

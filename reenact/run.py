@@ -225,6 +225,7 @@ class Run:
             clip,
             seed=1000 * config.training.seed + index,
             crowded=config.training.crowded,
+            uneven=config.training.uneven,
             device=device,
         )
 

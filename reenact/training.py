@@ -43,15 +43,13 @@ from reenact.holdout import NUMBER, Holdout
 from reenact.interrupts import Interrupts, Output, listening
 from reenact.lock import RunLock
 from reenact.losses import VertexDistance
-from reenact.models import Networks
+from reenact.models import PICTURES_PER_COMPONENT, Networks
 from reenact.pairs import Teacher
 from reenact.preview import save_preview
 from reenact.run import Run, restore_networks
 from reenact.stages import CHUNK, Pool, Stage, Workshop, find_stages, torch_random
 from reenact.team import Team, TeamError, team
 
-_PICTURES_PER_COMPONENT = 6
-"""Pictures of each rig, per principal component, from which networks learn what varies before any training."""
 _LOG_EVERY = 20
 """Steps between lines of metrics.jsonl; each holds the mean since the last."""
 
@@ -250,7 +248,7 @@ def _begin(run: Run, shop: Workshop) -> None:
         chunks = studio.surveyed(count).split(CHUNK)
         return shop.team.map(lambda _, chunk: studio.show(studio.photograph(chunk)), chunks)
 
-    count = _PICTURES_PER_COMPONENT * config.reenactnet.components
+    count = PICTURES_PER_COMPONENT * config.reenactnet.components
     if run.base:
         networks.load_state_dict(networks.state_dict() | run.base)
         known = [key for key in shop.studios if key not in shop.learning]

@@ -78,6 +78,11 @@ def test_what_shortly_preceded_formats_is_read_as_it_was_meant(stored):
     assert load_run_config(stored / "run").training.together is False  # there was no other way, and the default changed
 
 
+def test_what_was_trained_without_bounds_is_read_without():
+    for number in (0, 1):
+        assert load_run_config(FIXTURES / f"run-{number}" / "run").bpnet.bounded is False
+
+
 @pytest.fixture
 def run(tmp_path):
     shutil.copytree(STORED[-1] / "run", tmp_path / "run")
@@ -87,8 +92,9 @@ def run(tmp_path):
 def test_a_run_of_0_1_0_is_refused_with_the_version_that_opens_it(run):
     (run / "format.json").unlink()
     (run / "config.toml").write_text("[training]\necho = 2\n")
+    sentence = rf"run: expected a run of format {FORMAT} .*; open it with Reenact 0\.1\.0, or"
     for call in (Run.open, load_run_config):
-        with pytest.raises(ReenactError, match=r"run: expected a run of format 1 .*; open it with Reenact 0\.1\.0, or"):
+        with pytest.raises(ReenactError, match=sentence):
             call(run)
 
 

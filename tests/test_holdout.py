@@ -46,7 +46,7 @@ def test_the_numbers_are_what_inference_errs_by(parts, toy_run):
     wrong = {}
     for place, (source, target) in enumerate((toy_run.keys, toy_run.keys[::-1])):
         random = np.random.default_rng([3, 0, 0, place, 0x68656C64])
-        weights = motion.expressions(studios[source].rig.names, 20, random, studios[source].crowded)
+        weights = studios[source].random(20, random)
         retargeter = ImageRetargeter.load(toy_run.folder, source=source, target=target)
         moved = torch.stack([retargeter.step(row) for row in weights])
         told = teachers[source, target].weights(weights)
@@ -107,8 +107,8 @@ def test_no_expression_of_it_is_trained_on(toy_config, tmp_path, monkeypatch):
     drawn, checked = [], []
     expressions = motion.expressions
 
-    def told(names, count, seed, crowded=0.0):
-        made = expressions(names, count, seed, crowded)
+    def told(names, count, seed, *shares):
+        made = expressions(names, count, seed, *shares)
         if isinstance(seed, np.random.Generator):
             drawn.append(made)
         return made

@@ -8,7 +8,9 @@ from reenact.models import (
     ComponentReenactNet,
     ConvolutionalReenactNet,
     Eigenpictures,
+    LeakyClamp,
     Networks,
+    component_bpnet,
     convolutional_bpnet,
     energy,
     forward_macs,
@@ -79,6 +81,31 @@ def test_one_picture_gives_the_same_weights_alone_and_in_a_batch():
     torch.testing.assert_close(net(pictures)[2:3], net(pictures[2:3]), rtol=0, atol=1e-5)  # float32, other kernels
 
 
+def test_answers_beyond_the_range_count_a_hundredth_and_still_learn():
+    x = torch.tensor([[-3.0, 0.0, 0.25, 1.0, 2.0]], requires_grad=True)
+    y = LeakyClamp()(x)
+    torch.testing.assert_close(y, torch.tensor([[-0.03, 0.0, 0.25, 1.0, 1.01]]))
+    y.sum().backward()
+    torch.testing.assert_close(x.grad[0, [0, 2, 4]], torch.tensor([0.01, 1.0, 0.01]))
+
+
+@pytest.mark.parametrize("hidden", [0, 16])
+@pytest.mark.parametrize("kind", ["components", "convolutional"])
+def test_bounded_answers_are_the_published_ones_within_the_range(kind, hidden):
+    def answers(bounded):
+        torch.manual_seed(0)
+        config = BPNetConfig(channels=8, hidden=hidden, bounded=bounded)
+        net = component_bpnet(9, 12, config) if kind == "components" else convolutional_bpnet(9, 32, config)
+        return net(10 * torch.randn(64, *((12,) if kind == "components" else (3, 32, 32))))
+
+    free, bounded = answers(False), answers(True)
+    inside = (free >= 0) & (free <= 1)
+    assert inside.any()
+    assert torch.equal(free[inside], bounded[inside])
+    assert free.min() < -0.1
+    torch.testing.assert_close(bounded[free < 0], free[free < 0] / 100)
+
+
 def _low_rank(rank: int, count: int = 40, seed: int = 0) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     flat = torch.randn(count, rank, generator=generator) @ torch.randn(rank, 3 * 16 * 16, generator=generator) + 1.0
@@ -92,6 +119,18 @@ def test_pictures_come_back_from_their_mixtures():
     torch.testing.assert_close(basis.depict(basis.describe(pictures)), pictures, rtol=0, atol=1e-3)  # float32 vectors
     assert basis.describe(pictures).std(0, correction=0)[0] == pytest.approx(4.0, rel=1e-3)
     assert not basis.components[5:].any()  # five kinds of change need five components
+
+
+def test_a_frozen_basis_says_the_same_of_what_varies_and_of_what_never_did():
+    pictures, basis = _low_rank(5), Eigenpictures(8, 16)
+    pictures[:, :, 4:] = 0.25  # three quarters never vary
+    basis.fit(pictures, torch.ones(1, 16, 16))
+    others = pictures + torch.randn(pictures.shape, generator=torch.Generator().manual_seed(1))
+    before = basis.describe(others)
+    basis.freeze()
+    assert len(basis._varying[0]) == pictures[0].numel() // 4
+    torch.testing.assert_close(basis.describe(others), before, rtol=1e-4, atol=1e-4)  # sums in another order
+    assert basis.describe(others).abs().max() > 1
 
 
 def test_with_equal_components_the_distance_is_that_of_the_pictures():

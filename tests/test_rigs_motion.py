@@ -203,3 +203,13 @@ def test_crowded_expressions_move_many_shapes_and_stay_valid():
     assert dense.max() <= 1
     product = dense[:, arkit.NAMES.index("jawLeft")] * dense[:, arkit.NAMES.index("jawRight")]
     assert product.max() <= motion.BOTH + 1e-6  # float32
+
+
+def test_uneven_expressions_move_most_shapes_hardly_and_a_few_far():
+    even, uneven = (motion.expressions(arkit.NAMES, 2000, 3, 1.0, share) for share in (0.0, 1.0))
+    assert torch.equal(even, motion.expressions(arkit.NAMES, 2000, 3, 1.0))
+    usual, spread = (torch.quantile(each[each > 0], torch.tensor([0.1, 0.95])) for each in (even, uneven))
+    assert spread[0] < usual[0] / 3
+    assert spread[1] > usual[1]
+    assert uneven.max() <= 1
+    assert torch.equal(motion.expressions(arkit.NAMES, 500, 3, 0.0, 1.0), motion.expressions(arkit.NAMES, 500, 3))

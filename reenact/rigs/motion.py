@@ -31,7 +31,7 @@ BOTH = 0.1
 
 
 def expressions(
-    names: Sequence[str], count: int, seed: int | Generator, crowded: float = 0.0
+    names: Sequence[str], count: int, seed: int | Generator, crowded: float = 0.0, uneven: float = 0.0
 ) -> Float[Tensor, "{count} K"]:
     """Random valid expressions: weights in [0, 1], most of them 0.
 
@@ -48,6 +48,7 @@ def expressions(
         seed: A seed, or a generator that is advanced.
         crowded: Share of expressions in which any number of units are active, up to all of them, at a common strength
             from 0.2 to 1 of the usual. Recorded faces are like that: they move nearly every shape a little.
+        uneven: Share of those in which units also differ in strength: most move hardly, a few as far as they can.
     """
     table = _table(tuple(names))
     rng = np.random.default_rng(seed)
@@ -55,16 +56,20 @@ def expressions(
     # The smallest of exponential waiting times are a weighted draw without replacement.
     waits = rng.standard_exponential((count, groups), dtype=np.float32) / table.frequency
     active = np.minimum(1 + rng.poisson(2.0, count), groups)
-    strength = np.ones(count)
+    strength = np.ones((count, 1))
     if crowded:
         full = rng.random(count) < crowded
         active[full] = rng.integers(1, groups, count, endpoint=True)[full]
-        strength[full] = rng.uniform(0.2, 1.0, count)[full]
+        strength[full] = rng.uniform(0.2, 1.0, (count, 1))[full]
+    if crowded and uneven:
+        chosen = rng.random((count, 1)) < uneven
+        factor = 3 * rng.random((count, groups)) ** 2  # 1 in the mean
+        strength = np.where(full[:, None] & chosen, factor * strength, strength)
     last = np.take_along_axis(np.sort(waits, axis=1), active[:, None] - 1, axis=1)  # (N, 1)
     amplitude_normal = rng.standard_normal((2, count, groups), dtype=np.float32)
     amplitude_normal[1] = 0.91 * amplitude_normal[0] + 0.4146 * amplitude_normal[1]  # correlation 0.91, variance 1
     amplitudes = np.interp(ndtr(amplitude_normal), _QUANTILES, _BETA)
-    amplitudes *= (waits <= last) * strength[:, None]
+    amplitudes = np.minimum(amplitudes * (waits <= last) * strength, 1)
     alone = rng.random((count, groups), dtype=np.float32)
     alone[:, table.together] = 1
     amplitudes[0] *= ~((alone >= 0.15) & (alone < 0.3))
