@@ -71,23 +71,25 @@ class Eigenpictures(nn.Module):
         self.register_buffer("components", torch.zeros(count, size))
         self.register_buffer("unit", torch.ones(()))
         self.register_buffer("importance", torch.zeros(count))
-        self._varying: tuple[Tensor, ...] | None = None
+        for name in ("places", "weight_there", "mean_there", "components_there"):  # see `freeze`
+            self.register_buffer(name, None, persistent=False)
 
     def describe(self, shown: Float[Tensor, "B 3 R R"]) -> Float[Tensor, "B N"]:
         """The mixture that comes closest to each picture."""
         flat, weight, mean, components = shown.flatten(1), self.weight, self.mean, self.components
-        if self._varying is not None:
-            places, weight, mean, components = self._varying
-            flat = flat[:, places]
+        if self.places is not None:
+            flat, weight, mean = flat[:, self.places], self.weight_there, self.mean_there
+            components = self.components_there
         return (flat * weight - mean) @ components.T / self.unit
 
     def freeze(self) -> None:
-        """Describe faster from now on, for a basis that neither changes nor moves to another device any more.
+        """Describe faster from now on, for a basis that does not change any more.
 
         What never varies says nothing of any component: half of a portrait's motion pass.
         """
-        places = self.components.any(0).nonzero().flatten()
-        self._varying = places, self.weight[places], self.mean[places], self.components[:, places]
+        self.places = self.components.any(0).nonzero().flatten()
+        self.weight_there, self.mean_there = self.weight[self.places], self.mean[self.places]
+        self.components_there = self.components[:, self.places]
 
     def depict(self, mixtures: Float[Tensor, "B N"]) -> Float[Tensor, "B 3 R R"]:
         """The picture of each mixture."""
@@ -434,7 +436,7 @@ class Networks(nn.Module):
             self.fit(new, shown.__getitem__)
 
     def freeze(self) -> Networks:
-        """The networks themselves, faster, for use only: they must not learn, be loaded or moved any more."""
+        """The networks themselves, faster, for use only: they must not learn or be loaded any more."""
         for module in self.modules():
             if isinstance(module, Eigenpictures):
                 module.freeze()
