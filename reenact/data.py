@@ -95,10 +95,10 @@ class Studio:
     def draw(self, count: int, random: np.random.Generator) -> Float[Tensor, "N K"]:
         """Weights of training expressions: from the clip if there is one, else fresh."""
         if self.pool is None:
-            return self.random(count, random)
+            return self.expressions(count, random)
         return self.pool[random.integers(len(self.pool), size=count)]
 
-    def random(self, count: int, random: np.random.Generator) -> Float[Tensor, "N K"]:
+    def expressions(self, count: int, random: np.random.Generator) -> Float[Tensor, "N K"]:
         """Weights of random expressions, as many of them crowded as the settings say."""
         return motion.expressions(self.rig.names, count, random, self.crowded, self.uneven)
 

@@ -81,7 +81,7 @@ class Holdout:
         self.directions: list[_Direction] = []
         for place, (key, studio) in enumerate(studios.items()):
             random = np.random.default_rng([seed, 0, 0, place, _APART])
-            weights = studio.random(count, random)
+            weights = studio.expressions(count, random)
             seen = torch.cat([net.readable(net.describe(key, studio.glance(chunk))) for chunk in weights.split(_CHUNK)])
             if key in learning:
                 even = seen.new_full((count,), 1 / count)

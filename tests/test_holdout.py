@@ -46,7 +46,7 @@ def test_the_numbers_are_what_inference_errs_by(parts, toy_run):
     wrong = {}
     for place, (source, target) in enumerate((toy_run.keys, toy_run.keys[::-1])):
         random = np.random.default_rng([3, 0, 0, place, 0x68656C64])
-        weights = studios[source].random(20, random)
+        weights = studios[source].expressions(20, random)
         retargeter = ImageRetargeter.load(toy_run.folder, source=source, target=target)
         moved = torch.stack([retargeter.step(row) for row in weights])
         told = teachers[source, target].weights(weights)
