@@ -713,17 +713,13 @@ def _moved(retargeter: Any, clip: str) -> Clip:
 
 def _moved_by_networks(retargeter: Any, clip: str) -> Clip:
     """As `_moved`, with a bar: networks look at each frame by itself."""
-    import torch
     from rich.progress import track
 
     from reenact.rigs.files import load_clip
 
-    given = load_clip(clip, retargeter.source)
-    parts = given.weights.split(512)  # whole chunks of `ImageRetargeter`, so that nothing depends on the bar
     console = Console(stderr=True)
-    shown = track(parts, "Retargeting", console=console, transient=True, disable=not console.is_terminal)
-    made = [retargeter(replace(given, weights=part, rotations=None)) for part in shown]
-    return replace(given, names=retargeter.target.names, weights=torch.cat([each.weights for each in made]))
+    bar = partial(track, description="Retargeting", console=console, transient=True, disable=not console.is_terminal)
+    return retargeter(load_clip(clip, retargeter.source), bar)
 
 
 def _geometric(

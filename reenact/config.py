@@ -141,6 +141,9 @@ class BPNetConfig:
     there are pairs, else from the rig's own."""
     image_fraction: float = 0.0625
     """Share of the pictures whose predicted weights are rendered again for L_r, which costs more than all the rest."""
+    steady: float = 0.02
+    """Seconds of a clip over which small differences between what is read of its frames are smoothed at inference:
+    errors of reading tremble, blinks stay sharp. 0 leaves each frame as it was read; a frame alone always is."""
 
 
 @dataclass(frozen=True)
@@ -458,6 +461,7 @@ _ALLOWED: dict[str, _Rule] = {
     "training.threads": _ONE_OR_MORE,
     "post.rest": _NOT_NEGATIVE,
     "post.rest_seconds": _POSITIVE,
+    "bpnet.steady": ("a number of seconds from 0 to 2", lambda value: 0 <= value <= 2),
     "post.smooth": ("a number of seconds from 0 to 2", lambda value: 0 <= value <= 2),
     "post.smooth_range": _POSITIVE,
 }

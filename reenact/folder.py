@@ -123,8 +123,8 @@ def _from_0(table: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _from_1(table: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Before BPNet's answers were bounded, and crowded expressions uneven."""
-    for name, added in (("bpnet", {"bounded": False}), ("training", {"uneven": 0.0})):
+    """Before BPNet's answers were bounded and steadied, and crowded expressions uneven."""
+    for name, added in (("bpnet", {"bounded": False, "steady": 0.0}), ("training", {"uneven": 0.0})):
         section = table.get(name, {})
         if isinstance(section, dict):  # what is not is refused later
             table = {**table, name: {**added, **section}}

@@ -6,6 +6,7 @@ section 3: render the source, redraw it as the target with ReenactNet, read the 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -19,11 +20,14 @@ from reenact.data import Studio, check_device
 from reenact.errors import ReenactError
 from reenact.models import Networks
 from reenact.pairs import Teacher
+from reenact.postprocessing import smoothed
 from reenact.rigs.clip import Clip
 from reenact.run import Run
 
 _CHUNK = 64
 """Frames that are in memory as pictures at once."""
+_TREMOR = 0.08
+"""How far a weight strays by errors of reading, at most."""
 
 
 class ImageRetargeter:
@@ -83,8 +87,12 @@ class ImageRetargeter:
         return cls(run, run.studio(keys[0], device), run.studio(keys[1], device), networks, keys, older)
 
     @torch.inference_mode()
-    def __call__(self, clip: Clip) -> Clip:
-        """The clip on the target, weights in [0, 1].
+    def __call__(self, clip: Clip, watch: Callable[[Sequence[Tensor]], Iterable[Tensor]] = iter) -> Clip:
+        """The clip on the target, weights in [0, 1]: each frame as it is read, then steadied (`bpnet.steady`).
+
+        Args:
+            clip: Of the source.
+            watch: Goes through a list and tells someone how far it is, such as `rich.progress.track`.
 
         Raises:
             ReenactError: The clip's names are not the source's; `reenact.rigs.files.load_clip` puts them in order.
@@ -94,12 +102,13 @@ class ImageRetargeter:
                 f"clip: expected the {len(self.source.names)} names of {self.source.name} in their order, got "
                 f"{', '.join(clip.names[:3])} and so on; `reenact.rigs.files.conform` gives it those"
             )
-        weights = [self._retarget(chunk) for chunk in clip.weights.split(_CHUNK)]
-        return replace(clip, names=self.target.names, weights=torch.cat(weights))
+        read = torch.cat([self._retarget(chunk) for chunk in watch(clip.weights.split(_CHUNK))])
+        steady = smoothed(read, self.run.config.bpnet.steady * clip.fps, _TREMOR)
+        return replace(clip, names=self.target.names, weights=steady)
 
     @torch.inference_mode()
     def step(self, weights: Float[Tensor, "Ks"]) -> Float[Tensor, "Kt"]:
-        """Weights of one frame, in [0, 1]; the same as in a clip."""
+        """Weights of one frame, in [0, 1]; the same as in a clip before it is steadied, which takes later frames."""
         return self._retarget(weights[None])[0]
 
     def _retarget(self, weights: Float[Tensor, "N Ks"]) -> Float[Tensor, "N Kt"]:

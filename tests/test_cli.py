@@ -545,27 +545,6 @@ def test_a_geometric_method_takes_the_rigs_of_a_run(tmp_path, toy_run, capsys):
     assert "either a RUN or --source and --target" in sentence
 
 
-def test_a_long_clip_passes_through_networks_in_parts_as_it_would_whole(toy_rig, tmp_path):
-    class Turned:
-        """Frame by frame, as networks do it."""
-
-        source, target, seen = toy_rig, toy_rig, []
-
-        def __call__(self, clip):
-            self.seen.append(len(clip))
-            return replace(clip, weights=clip.weights.flip(1))
-
-    count = 1100
-    weights = torch.rand(count, len(toy_rig.names), generator=torch.Generator().manual_seed(0))
-    path = tmp_path / "long.npz"
-    save_clip(Clip(toy_rig.names, weights, 24.0), path)
-    turned = Turned()
-    moved = cli._moved_by_networks(turned, str(path))
-    assert torch.equal(moved.weights, weights.flip(1))
-    assert (moved.fps, moved.names) == (24.0, toy_rig.names)
-    assert turned.seen == [512, 512, 76]
-
-
 def test_commands_take_the_checkpoint_that_is_asked_for_and_name_it(older_run, tmp_path, capsys):
     command = ["infer", f"{older_run}", "synthetic:1:1", "--out", f"{tmp_path / 'x.csv'}", "--checkpoint"]
     for which, said in (("newest", "ball -> egg"), ("best", "ball -> egg, of step 20"), ("10", "egg, of step 10")):

@@ -1,30 +1,70 @@
 """A trained run moves clips, frame by frame as in batches."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from reenact.cli import main
 from reenact.errors import ReenactError
 from reenact.inference import ImageRetargeter
+from reenact.postprocessing import smoothed
 from reenact.rigs.clip import Clip
 from reenact.rigs.files import load_clip
 
 
+def without_steadying(run):
+    """The retargeter of a run whose clips are what is read of each frame."""
+    retargeter = ImageRetargeter.load(run.folder)
+    config = retargeter.run.config
+    retargeter.run = replace(retargeter.run, config=replace(config, bpnet=replace(config.bpnet, steady=0.0)))
+    return retargeter
+
+
+def some_clip(retargeter, frames):
+    """Expressions that move now and then, at 30 frames a second."""
+    names = retargeter.source.names
+    some = torch.rand(frames // 5 + 1, len(names), generator=torch.Generator().manual_seed(0))
+    return Clip(names, some.repeat_interleave(5, 0)[:frames], 30.0)
+
+
 def test_a_frame_alone_gives_the_weights_that_it_has_in_a_clip(toy_run):
-    retargeter = ImageRetargeter.load(toy_run.folder)
-    weights = torch.rand(70, len(retargeter.source.names), generator=torch.Generator().manual_seed(0))
-    moved = retargeter(Clip(retargeter.source.names, weights, 30.0))
+    retargeter = without_steadying(toy_run)
+    clip = some_clip(retargeter, 70)
+    moved = retargeter(clip)
     assert moved.names == retargeter.target.names
-    single = torch.stack([retargeter.step(frame) for frame in weights[60:]])
+    single = torch.stack([retargeter.step(frame) for frame in clip.weights[60:]])
     torch.testing.assert_close(single, moved.weights[60:], rtol=0, atol=1e-5)  # float32, other batch size
 
 
 def test_a_clip_is_what_is_read_from_the_redrawn_pictures(toy_run):
+    retargeter = without_steadying(toy_run)
+    clip = some_clip(retargeter, 9)
+    through = retargeter.read(retargeter.reenact(retargeter.source_pictures(clip.weights)))
+    torch.testing.assert_close(retargeter(clip).weights, through, rtol=0, atol=1e-4)  # drawn and described in float32
+
+
+def test_a_clip_is_steadied_over_its_own_time(toy_run):
+    retargeter, plain = ImageRetargeter.load(toy_run.folder), without_steadying(toy_run)
+    clip = some_clip(retargeter, 70)  # more than fit in memory as pictures at once
+    for fps in (30.0, 120.0):
+        read = plain(replace(clip, fps=fps)).weights
+        moved = retargeter(replace(clip, fps=fps)).weights
+        torch.testing.assert_close(moved, smoothed(read, 0.02 * fps, 0.08), rtol=0, atol=1e-5)
+        assert (moved - read).abs().max() > 1e-3
+
+
+def test_a_clip_can_be_watched_on_its_way(toy_run):
     retargeter = ImageRetargeter.load(toy_run.folder)
-    weights = torch.rand(9, len(retargeter.source.names), generator=torch.Generator().manual_seed(0))
-    through = retargeter.read(retargeter.reenact(retargeter.source_pictures(weights)))
-    moved = retargeter(Clip(retargeter.source.names, weights, 30.0)).weights
-    torch.testing.assert_close(moved, through, rtol=0, atol=1e-4)  # drawn and described again in float32
+    clip, seen = some_clip(retargeter, 130), []
+
+    def watch(parts):
+        for part in parts:
+            seen.append(len(part))
+            yield part
+
+    assert torch.equal(retargeter(clip, watch).weights, retargeter(clip).weights)
+    assert seen == [64, 64, 2]
 
 
 def test_a_clip_with_other_names_is_refused(toy_run):
