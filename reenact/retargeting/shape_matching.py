@@ -25,6 +25,7 @@ from torch import Tensor
 
 from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence
+from reenact.retargeting.hidden import hidden_motions
 from reenact.retargeting.inverse_rig import nonnegative_least_squares
 from reenact.retargeting.rbf import carry_shapes
 from reenact.retargeting.retargeter import check_names
@@ -57,6 +58,9 @@ class ShapeMatchingConfig:
     places get wrong by less then matters less."""
     stiffness: float = 1.0
     """Of the thin-plate map, see `carry_shapes`."""
+    copying: float = 10.0
+    """How much a shape wants its partner's weight, as a share of how much a typical shape moves the places; the rest is
+    for shapes without one. It also decides what places do not see: a tongue moves none."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +81,22 @@ class Partners:
     def ours(self) -> set[int]:
         """Our shapes that have a partner."""
         return {part for *parts, _ in (*self.single, *self.merged) for part in parts} | {j for j, *_ in self.split}
+
+    def copied(self, count: int, their_count: int) -> Float[Tensor, "Ks Kt"]:
+        """Their weights as ours, where partners mean each other at full strength: the mean of two that one does.
+
+        Args:
+            count: Of our shapes.
+            their_count: Of theirs.
+        """
+        found = torch.zeros(count, their_count)
+        for j, k in self.single:
+            found[j, k] = 1.0
+        for first, second, k in self.merged:
+            found[first, k] = found[second, k] = 0.5
+        for j, *both in self.split:
+            found[j, both] = 1.0
+        return found
 
     def personal(self, ours: Float[Tensor, "Ks N 3"], theirs: Float[Tensor, "Kt N 3"]) -> Float[Tensor, "Kt N 3"]:
         """Their shapes as our rig would perform them: our own where there is a partner, theirs elsewhere.
@@ -115,7 +135,7 @@ class ShapeMatching:
             training: Not used.
             config: Settings.
             likeness: Cosines of what shapes look like, where pictures of them are at hand. They help to find partners:
-                they see what places on the skin do not, eyeballs and the inside of the mouth.
+                they see what places on the skin hardly do, eyeballs and the inside of the mouth.
 
         Raises:
             ReenactError: There is no correspondence.
@@ -126,7 +146,7 @@ class ShapeMatching:
         config = config or ShapeMatchingConfig()
         self.carried = carry_shapes(source, target, correspondence, stiffness=config.stiffness)
         ours, theirs = self.carried.source_shapes, self.carried.guess
-        compared = self._compared(config)
+        compared = self._compared(config, correspondence)
         sure = find_partners(*compared, replace(config, similarity=config.sure))
         believed = len(sure.single) >= config.share * min(len(source.names), len(target.names))
         self.partners = find_partners(*compared, config, likeness) if believed else Partners()
@@ -135,6 +155,10 @@ class ShapeMatching:
         weighted = personal * self.carried.confidence[:, None]
         self.gram = torch.einsum("kni,lni->kl", weighted, personal)
         self._projection = torch.einsum("sni,kni->sk", ours, weighted)  # (Ks, Kt)
+        copied = self.partners.copied(len(ours), len(theirs)).to(ours)
+        pull = config.copying * self.gram.diagonal().median()
+        self.gram += pull * torch.diag(copied.sum(0))
+        self._projection += pull * copied
 
     def __call__(self, clip: Clip) -> Clip:
         """The clip on the target, weights in [0, 1]."""
@@ -143,8 +167,13 @@ class ShapeMatching:
         weights = nonnegative_least_squares(self.gram, projections, high=1.0)
         return replace(clip, names=self.target.names, weights=weights.float())
 
-    def _compared(self, config: ShapeMatchingConfig) -> tuple[Float[Tensor, "Ks D"], Float[Tensor, "Kt D"]]:
-        """Motions of both rigs' shapes as rows, averaged over neighbouring places and weighted by confidence."""
+    def _compared(
+        self, config: ShapeMatchingConfig, correspondence: Correspondence
+    ) -> tuple[Float[Tensor, "Ks D"], Float[Tensor, "Kt D"]]:
+        """Motions of both rigs' shapes as rows, averaged over neighbouring places and weighted by confidence.
+
+        Shapes that move no place are compared inside, see `reenact.retargeting.hidden`.
+        """
         places = self.carried.source_neutral
         width = config.blur * float((places - places.mean(0)).square().sum(1).mean().sqrt())
         ours, theirs = [], []
@@ -153,7 +182,8 @@ class ShapeMatching:
             near = near / near.sum(1, keepdim=True).clamp_min(1e-12) * trust.sqrt()[:, None]
             ours.append(torch.einsum("nm,kmi->kni", near, self.carried.source_shapes).flatten(1))
             theirs.append(torch.einsum("nm,kmi->kni", near, self.carried.guess).flatten(1))
-        return torch.cat(ours, 1), torch.cat(theirs, 1)
+        inside = hidden_motions(self.source, self.target, correspondence, self.carried, 3 * width)
+        return torch.cat([*ours, inside[0]], 1), torch.cat([*theirs, inside[1]], 1)
 
 
 def find_partners(
