@@ -25,7 +25,7 @@ from torch import Tensor
 
 from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence
-from reenact.retargeting.hidden import hidden_motions
+from reenact.retargeting.inside import Inside
 from reenact.retargeting.inverse_rig import nonnegative_least_squares
 from reenact.retargeting.rbf import carry_shapes
 from reenact.retargeting.retargeter import check_names
@@ -172,7 +172,7 @@ class ShapeMatching:
     ) -> tuple[Float[Tensor, "Ks D"], Float[Tensor, "Kt D"]]:
         """Motions of both rigs' shapes as rows, averaged over neighbouring places and weighted by confidence.
 
-        Shapes that move no place are compared inside, see `reenact.retargeting.hidden`.
+        Shapes that move no place are compared inside, see `reenact.retargeting.inside`.
         """
         places = self.carried.source_neutral
         width = config.blur * float((places - places.mean(0)).square().sum(1).mean().sqrt())
@@ -182,8 +182,8 @@ class ShapeMatching:
             near = near / near.sum(1, keepdim=True).clamp_min(1e-12) * trust.sqrt()[:, None]
             ours.append(torch.einsum("nm,kmi->kni", near, self.carried.source_shapes).flatten(1))
             theirs.append(torch.einsum("nm,kmi->kni", near, self.carried.guess).flatten(1))
-        inside = hidden_motions(self.source, self.target, correspondence, self.carried, 3 * width)
-        return torch.cat([*ours, inside[0]], 1), torch.cat([*theirs, inside[1]], 1)
+        hidden = Inside.of(self.source, self.target, correspondence, config.stiffness).hidden()
+        return torch.cat([*ours, hidden[0]], 1), torch.cat([*theirs, hidden[1]], 1)
 
 
 def find_partners(
