@@ -28,6 +28,8 @@ KINDS = ("mixed", "speech", "emotion", "expressions", "blinks", "ramps")
 
 BOTH = 0.1
 """Two shapes that exclude each other keep the product of their weights below this."""
+_TONGUE = 0.15
+"""Chance of a tongue to be out in crowded expressions, beside that of another shape to be active."""
 
 
 def expressions(
@@ -47,7 +49,8 @@ def expressions(
         count: Expressions.
         seed: A seed, or a generator that is advanced.
         crowded: Share of expressions in which any number of units are active, up to all of them, at a common strength
-            from 0.2 to 1 of the usual. Recorded faces are like that: they move nearly every shape a little.
+            from 0.2 to 1 of the usual. Recorded faces are like that: they move nearly every shape a little, but for
+            the tongue, which stays in while it can.
         uneven: Share of those in which units also differ in strength: most move hardly, a few as far as they can.
     """
     table = _table(tuple(names))
@@ -59,6 +62,7 @@ def expressions(
     strength = np.ones((count, 1))
     if crowded:
         full = rng.random(count) < crowded
+        waits[full] /= table.eagerness
         active[full] = rng.integers(1, groups, count, endpoint=True)[full]
         strength[full] = rng.uniform(0.2, 1.0, (count, 1))[full]
     if crowded and uneven:
@@ -188,6 +192,7 @@ class _Table:
     paired: np.ndarray  # (G,) bool
     together: np.ndarray  # (G,) bool: no sides, or never on one side only
     frequency: np.ndarray  # (G,) relative chance of being active
+    eagerness: np.ndarray  # (G,) factor of it in crowded expressions
     opposed: np.ndarray  # (E, 2)
     correctives: tuple[tuple[int, int], ...]
 
@@ -238,6 +243,7 @@ def _table(names: tuple[str, ...]) -> _Table:
             ]
         ),
         frequency=np.array([2.0 if name and name[0].startswith("eyeBlink") else 1.0 for name in canon], np.float32),
+        eagerness=np.array([_TONGUE if name and name[0] == "tongueOut" else 1.0 for name in canon], np.float32),
         opposed=np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2),
         correctives=tuple(
             (i, j)
