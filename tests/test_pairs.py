@@ -1,6 +1,7 @@
 """Shapes that do the same are found by what they look like, and nothing that only one rig claims is believed."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -8,7 +9,7 @@ import torch
 from reenact.config import ImageConfig, LayoutConfig, PairsConfig
 from reenact.data import Studio
 from reenact.layout import find_layout
-from reenact.pairs import Pairs, _agreed, find_pairs, find_teacher
+from reenact.pairs import Pairs, Teacher, _agreed, find_pairs, find_teacher
 from reenact.rigs import anny
 
 SMALL = ImageConfig(resolution=32)
@@ -84,3 +85,21 @@ def test_a_face_at_rest_can_be_corrected(toy_pair):
     wanted = torch.tensor([[0.0, 0, 0, 0.2, 0, 0, 0]])
     taught = find_teacher(source, target, PairsConfig(method="pictures"), corrected=(torch.zeros(1, 7), wanted))
     torch.testing.assert_close(taught.weights(torch.zeros(1, 7)), wanted, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("similarity", "say"), [(0.6, 0.0), (0.8, 0.35), (0.9, 0.5)])
+def test_pictures_join_geometry_where_the_rigs_can_look_alike(similarity, say):
+    pictures = Pairs(
+        matrix=torch.eye(3),
+        similarity=torch.full((3,), similarity),
+        agreed=(),
+        strength=torch.tensor([1.0, 2.0, 3.0]),
+        likeness=torch.eye(3),
+    )
+    assert pictures.alike == pytest.approx(similarity**2)
+    half = SimpleNamespace(partners=(), weights=lambda weights: 0.5 * weights)
+    weights = torch.rand(4, 3, generator=torch.Generator().manual_seed(0))
+    expected = weights * (0.5 + say) / (1 + say)
+    torch.testing.assert_close(Teacher(pictures, half).weights(weights), expected)
+    paired = SimpleNamespace(partners=(0,), weights=lambda weights: 0.5 * weights)
+    torch.testing.assert_close(Teacher(pictures, paired).weights(weights), 0.5 * weights)

@@ -205,6 +205,13 @@ def test_crowded_expressions_move_many_shapes_and_stay_valid():
     assert product.max() <= motion.BOTH + 1e-6  # float32
 
 
+def test_the_tongue_stays_in_in_most_crowded_expressions_and_moves_as_often_as_others_elsewhere():
+    tongue = arkit.NAMES.index("tongueOut")
+    usual, dense = (motion.expressions(arkit.NAMES, 2000, 3, crowded) > 0.01 for crowded in (0.0, 1.0))
+    assert usual[:, tongue].float().mean() > 0.8 * usual.float().mean()
+    assert dense[:, tongue].float().mean() < 0.5 * dense.float().mean()
+
+
 def test_uneven_expressions_move_most_shapes_hardly_and_a_few_far():
     even, uneven = (motion.expressions(arkit.NAMES, 2000, 3, 1.0, share) for share in (0.0, 1.0))
     assert torch.equal(even, motion.expressions(arkit.NAMES, 2000, 3, 1.0))
