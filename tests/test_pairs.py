@@ -1,7 +1,6 @@
 """Shapes that do the same are found by what they look like, and nothing that only one rig claims is believed."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,9 +9,25 @@ from reenact.config import ImageConfig, LayoutConfig, PairsConfig
 from reenact.data import Studio
 from reenact.layout import find_layout
 from reenact.pairs import Pairs, Teacher, _agreed, find_pairs, find_teacher
+from reenact.retargeting.labels import Labels
+from reenact.retargeting.shape_matching import Partners
 from reenact.rigs import anny
 
 SMALL = ImageConfig(resolution=32)
+
+
+class HalfLabels(Labels):
+    """Labels that say half of what the source does."""
+
+    def __init__(self, partners):
+        self.known = partners
+
+    @property
+    def partners(self):
+        return self.known
+
+    def weights(self, source_weights):
+        return 0.5 * source_weights
 
 
 def _renamed(rig, order):
@@ -97,9 +112,8 @@ def test_pictures_join_geometry_where_the_rigs_can_look_alike(similarity, say):
         likeness=torch.eye(3),
     )
     assert pictures.alike == pytest.approx(similarity**2)
-    half = SimpleNamespace(partners=(), weights=lambda weights: 0.5 * weights)
     weights = torch.rand(4, 3, generator=torch.Generator().manual_seed(0))
     expected = weights * (0.5 + say) / (1 + say)
-    torch.testing.assert_close(Teacher(pictures, half).weights(weights), expected)
-    paired = SimpleNamespace(partners=(0,), weights=lambda weights: 0.5 * weights)
+    torch.testing.assert_close(Teacher(pictures, HalfLabels(Partners())).weights(weights), expected)
+    paired = HalfLabels(Partners(single=((0, 0),)))
     torch.testing.assert_close(Teacher(pictures, paired).weights(weights), 0.5 * weights)
