@@ -270,22 +270,21 @@ def jitter(predicted: Float[Tensor, "T K"], truth: Float[Tensor, "T K"]) -> floa
     return 1.0 if sizes == [0.0, 0.0] else _ratio(*sizes)
 
 
-def common_shapes(source: tuple[str, ...], target: tuple[str, ...]) -> tuple[list[int], list[int]]:
-    """Indices of the shapes that two rigs name alike, in the order of the target.
+def shared_shapes(source: tuple[str, ...], target: tuple[str, ...]) -> Float[Tensor, "Ks Kt"]:
+    """What each shape of a target should do of each of a source's, as far as names tell: truth = weights @ this.
 
-    Names agree where they stand for the same ARKit shape, or are equal. Equal names promise equal meaning only
-    between rigs of one maker; across makers a part of the error is a difference of opinion between sculptors.
+    Names agree where they stand for the same ARKit shape, or are equal. Both halves of a split `browInnerUp` do what
+    the whole does, and the whole the mean of the halves. Equal names promise equal meaning only between rigs of one
+    maker; across makers a part of the error is a difference of opinion between sculptors.
     """
-    index: dict[str, int] = {}
+    standing: dict[str, list[int]] = {}
     for i, name in enumerate(source):
-        index.setdefault(canonical(name) or name, i)
-    taken: dict[int, int] = {}
+        standing.setdefault(canonical(name) or name, []).append(i)
+    shared = torch.zeros(len(source), len(target))
     for j, name in enumerate(target):
-        i = index.get(canonical(name) or name)
-        if i is not None:
-            taken.setdefault(i, j)
-    pairs = sorted(taken.items(), key=lambda pair: pair[1])
-    return [i for i, _ in pairs], [j for _, j in pairs]
+        alike = standing.get(canonical(name) or name, [])
+        shared[alike, j] = 1 / max(len(alike), 1)
+    return shared
 
 
 def true_weights(
@@ -303,15 +302,13 @@ def true_weights(
         and the indices of the target's shapes that the truth covers, none where the rigs share no name.
     """
     full_source, source_matrix = _unmerged(source)
-    full_target = _in_arkit(target) if common_shapes(full_source.names, target.names) == ([], []) else target
+    full_target = target if shared_shapes(full_source.names, target.names).any() else _in_arkit(target)
     full_target = full_target if full_target is not target else _unmerged(target)[0]
-    here, there = common_shapes(full_source.names, full_target.names)
-    partnered = torch.zeros(len(full_source.names), dtype=torch.bool)
-    partnered[here] = True
+    shared = shared_shapes(full_source.names, full_target.names)
+    there = shared.any(0).nonzero().flatten().tolist()
     known = weights.clone()
-    known[:, source_matrix[~partnered].abs().sum(0) > 0] = 0
-    truth = torch.zeros(len(weights), len(full_target.names))
-    truth[:, there] = (known @ source_matrix.T)[:, here]
+    known[:, source_matrix[~shared.any(1)].abs().sum(0) > 0] = 0
+    truth = known @ source_matrix.T @ shared
     if full_target is target:
         return known, truth.clamp(0, 1), there
     return known, _fit(full_target, truth, target), list(range(len(target.names))) if there else []

@@ -259,11 +259,18 @@ def test_jitter_counts_second_differences():
     assert evaluation.jitter(predicted, torch.zeros(4, 1)) == math.inf
 
 
-def test_common_shapes_meet_across_spellings_and_exact_names():
+def test_shapes_meet_across_spellings_and_exact_names():
     source = ("JawOpen", "odd one", "eyeBlink_L", "lonely")
     target = ("eyeBlinkLeft", "odd one", "jawOpen", "other")
-    assert evaluation.common_shapes(source, target) == ([2, 1, 0], [0, 1, 2])
-    assert evaluation.common_shapes(("a",), ("b",)) == ([], [])
+    shared = evaluation.shared_shapes(source, target)
+    assert shared.tolist() == [[0, 0, 1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]]
+    assert not evaluation.shared_shapes(("a",), ("b",)).any()
+
+
+def test_both_halves_of_a_split_shape_do_what_the_whole_does_and_the_whole_their_mean():
+    whole, halves = ("jawOpen", "browInnerUp"), ("browInnerUp_L", "jawOpen", "browInnerUp_R")
+    assert evaluation.shared_shapes(whole, halves).tolist() == [[0, 1, 0], [1, 0, 1]]
+    assert evaluation.shared_shapes(halves, whole).tolist() == [[0, 0.5], [1, 0], [0, 0.5]]
 
 
 def test_a_rig_that_shares_all_names_should_copy():
