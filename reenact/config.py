@@ -409,6 +409,7 @@ _Rule = tuple[str, Callable[[Any], bool]]
 _ONE_OR_MORE: _Rule = ("a whole number of at least 1", lambda value: value >= 1)
 _EIGHTS: _Rule = ("a multiple of 8", lambda value: value >= 8 and value % 8 == 0)  # normalized in 8 groups
 _POSITIVE: _Rule = ("a number above 0", lambda value: value > 0)
+_SHORT: _Rule = ("a number of seconds from 0 to 2", lambda value: 0 <= value <= 2)
 _NOT_NEGATIVE: _Rule = ("a number of at least 0", lambda value: value >= 0)
 _FRACTION: _Rule = ("a number from 0 to 1", lambda value: 0 <= value <= 1)
 _ALLOWED: dict[str, _Rule] = {
@@ -440,6 +441,7 @@ _ALLOWED: dict[str, _Rule] = {
     "bpnet.image_loss": _NOT_NEGATIVE,
     "bpnet.vertex_loss": _NOT_NEGATIVE,
     "bpnet.decoded_fraction": _FRACTION,
+    "bpnet.steady": _SHORT,
     "training.steps": _ONE_OR_MORE,
     "training.epochs": _POSITIVE,
     "training.batch_size": _ONE_OR_MORE,
@@ -461,8 +463,7 @@ _ALLOWED: dict[str, _Rule] = {
     "training.threads": _ONE_OR_MORE,
     "post.rest": _NOT_NEGATIVE,
     "post.rest_seconds": _POSITIVE,
-    "bpnet.steady": ("a number of seconds from 0 to 2", lambda value: 0 <= value <= 2),
-    "post.smooth": ("a number of seconds from 0 to 2", lambda value: 0 <= value <= 2),
+    "post.smooth": _SHORT,
     "post.smooth_range": _POSITIVE,
 }
 """What the numbers allow, in words and as a test; None always passes where the type has it."""

@@ -35,8 +35,8 @@ from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence, find_correspondence
 from reenact.retargeting.retargeter import Retargeter
 from reenact.rigs import motion
-from reenact.rigs.arkit import canonical
 from reenact.rigs.clip import Clip
+from reenact.rigs.matching import matching
 from reenact.rigs.rig import Rig
 
 KINDS = motion.KINDS
@@ -270,41 +270,26 @@ def jitter(predicted: Float[Tensor, "T K"], truth: Float[Tensor, "T K"]) -> floa
     return 1.0 if sizes == [0.0, 0.0] else _ratio(*sizes)
 
 
-def shared_shapes(source: tuple[str, ...], target: tuple[str, ...]) -> Float[Tensor, "Ks Kt"]:
-    """What each shape of a target should do of each of a source's, as far as names tell: truth = weights @ this.
-
-    Names agree where they stand for the same ARKit shape, or are equal. Both halves of a split `browInnerUp` do what
-    the whole does, and the whole the mean of the halves. Equal names promise equal meaning only between rigs of one
-    maker; across makers a part of the error is a difference of opinion between sculptors.
-    """
-    standing: dict[str, list[int]] = {}
-    for i, name in enumerate(source):
-        standing.setdefault(canonical(name) or name, []).append(i)
-    shared = torch.zeros(len(source), len(target))
-    for j, name in enumerate(target):
-        alike = standing.get(canonical(name) or name, [])
-        shared[alike, j] = 1 / max(len(alike), 1)
-    return shared
-
-
 def true_weights(
     source: Rig, target: Rig, weights: Float[Tensor, "T Ks"]
 ) -> tuple[Float[Tensor, "T Ks"], Float[Tensor, "T Kt"], list[int]]:
     """What the target should do, as far as names tell.
 
-    Between rigs that share names the same shapes get the same weights. A merged character (`anny:merged`) shares names
-    but not ranges, and stands for the full set that it was made from by a known matrix: from it the weights are those
-    of the full set, to it they are the bounded least-squares fit to the full set's vertices. So it is for a built-in
-    character with other shapes altogether (`anny:units`): its own head with ARKit's shapes says what it should do.
+    Between rigs that share names the same shapes get the same weights (`matching`). Equal names promise equal meaning
+    only between rigs of one maker; across makers a part of the error is a difference of opinion between sculptors. A
+    merged character (`anny:merged`) shares names but not ranges, and stands for the full set that it was made from by a
+    known matrix: from it the weights are those of the full set, to it they are the bounded least-squares fit to the
+    full set's vertices. So it is for a built-in character with other shapes altogether (`anny:units`): its own head
+    with ARKit's shapes says what it should do.
 
     Returns:
         The source's weights with every shape at rest whose meaning the target does not know; the target's weights;
         and the indices of the target's shapes that the truth covers, none where the rigs share no name.
     """
     full_source, source_matrix = _unmerged(source)
-    full_target = target if shared_shapes(full_source.names, target.names).any() else _in_arkit(target)
+    full_target = target if matching(full_source.names, target.names).any() else _in_arkit(target)
     full_target = full_target if full_target is not target else _unmerged(target)[0]
-    shared = shared_shapes(full_source.names, full_target.names)
+    shared = matching(full_source.names, full_target.names)
     there = shared.any(0).nonzero().flatten().tolist()
     known = weights.clone()
     known[:, source_matrix[~shared.any(1)].abs().sum(0) > 0] = 0

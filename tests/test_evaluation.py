@@ -19,6 +19,7 @@ from reenact.config import Config
 from reenact.errors import ReenactError
 from reenact.retargeting.correspondence import Correspondence, Places
 from reenact.rigs.clip import Clip
+from reenact.rigs.matching import matching
 from reenact.rigs.rig import Rig
 from reenact.run import Run
 
@@ -262,15 +263,15 @@ def test_jitter_counts_second_differences():
 def test_shapes_meet_across_spellings_and_exact_names():
     source = ("JawOpen", "odd one", "eyeBlink_L", "lonely")
     target = ("eyeBlinkLeft", "odd one", "jawOpen", "other")
-    shared = evaluation.shared_shapes(source, target)
+    shared = matching(source, target)
     assert shared.tolist() == [[0, 0, 1, 0], [0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]]
-    assert not evaluation.shared_shapes(("a",), ("b",)).any()
+    assert not matching(("a",), ("b",)).any()
 
 
 def test_both_halves_of_a_split_shape_do_what_the_whole_does_and_the_whole_their_mean():
     whole, halves = ("jawOpen", "browInnerUp"), ("browInnerUp_L", "jawOpen", "browInnerUp_R")
-    assert evaluation.shared_shapes(whole, halves).tolist() == [[0, 1, 0], [1, 0, 1]]
-    assert evaluation.shared_shapes(halves, whole).tolist() == [[0, 0.5], [1, 0], [0, 0.5]]
+    assert matching(whole, halves).tolist() == [[0, 1, 0], [1, 0, 1]]
+    assert matching(halves, whole).tolist() == [[0, 0.5], [1, 0], [0, 0.5]]
 
 
 def test_a_rig_that_shares_all_names_should_copy():

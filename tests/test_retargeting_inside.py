@@ -13,6 +13,7 @@ from reenact.retargeting.consensus import Consensus
 from reenact.retargeting.correspondence import Correspondence, Places
 from reenact.retargeting.inside import Inside
 from reenact.retargeting.labels import Labels
+from reenact.retargeting.rbf import carry_shapes
 from reenact.retargeting.shape_matching import ShapeMatching
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
@@ -54,6 +55,11 @@ def with_eye_and_tongue(rig: Rig, stretch: float = 1.0, degrees: float = 20.0, l
 def pairs_on_skin(source: Rig, target: Rig) -> Correspondence:
     chosen = farthest_points(make_toy_rig("ball").neutral, 120)
     return Correspondence(Places.at(chosen), Places.at(chosen), torch.ones(120))
+
+
+def inside(source: Rig, target: Rig) -> Inside:
+    pairs = pairs_on_skin(source, target)
+    return Inside.of(source, target, pairs, carry_shapes(source, target, pairs, stiffness=1.0))
 
 
 @pytest.fixture(scope="module")
@@ -113,10 +119,10 @@ def test_the_jaw_that_carries_a_tongue_does_not_put_it_out(heads):
         deltas = rig.deltas.clone()
         deltas[jaw, tongue] = torch.tensor([0.0, -0.01, 0.0])
         carried.append(replace(rig, deltas=deltas))
-    inside = Inside.of(*carried, pairs_on_skin(*heads))
+    made = inside(*carried)
     weights = torch.zeros(1, len(source.names))
     weights[0, jaw] = 1.0
-    torch.testing.assert_close(inside.corrected(weights, weights), weights, rtol=0, atol=0.02)
+    torch.testing.assert_close(made.corrected(weights, weights), weights, rtol=0, atol=0.02)
 
 
 def test_lashes_go_with_the_skin_and_are_not_inside(heads):
@@ -131,13 +137,13 @@ def test_lashes_go_with_the_skin_and_are_not_inside(heads):
         deltas = longer.deltas.clone()
         deltas[: len(rig.names), -len(points) :] = rig.deltas[:, near]
         rigs.append(replace(longer, deltas=deltas))
-    plain, lashed = Inside.of(*heads, pairs_on_skin(*heads)), Inside.of(*rigs, pairs_on_skin(*heads))
+    plain, lashed = inside(*heads), inside(*rigs)
     torch.testing.assert_close(lashed.ours[: len(heads[0].names)], plain.ours)
     assert not lashed.ours[-1].any()
 
 
 def test_heads_without_anything_inside_are_left_alone(toy_pair):
-    inside = Inside.of(*toy_pair, pairs_on_skin(*toy_pair))
+    made = inside(*toy_pair)
     weights = torch.rand(3, len(toy_pair[1].names))
-    assert inside.ours.shape == (len(toy_pair[0].names), 0)
-    assert inside.corrected(weights, weights) is weights
+    assert made.ours.shape == (len(toy_pair[0].names), 0)
+    assert made.corrected(weights, weights) is weights

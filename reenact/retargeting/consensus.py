@@ -18,7 +18,6 @@ from torch import Tensor
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.deformation_transfer import DeformationTransfer, densify
 from reenact.retargeting.delta_transfer import DeltaTransfer
-from reenact.retargeting.inside import Inside
 from reenact.retargeting.rbf import ProportionMatching
 from reenact.retargeting.retargeter import Retargeter, check_names
 from reenact.retargeting.shape_matching import ShapeMatching
@@ -53,8 +52,6 @@ class Consensus:
         self.matching = ShapeMatching(source, target, correspondence, likeness=likeness)
         """Its `partners` are empty where the rigs are not built to one scheme."""
         self.methods: tuple[Retargeter, ...] = (self.matching,)
-        self.inside: Inside | None = None
-        """Where three methods are asked."""
         if not self.matching.partners:
             dense = densify(source, target, correspondence)
             self.methods = (
@@ -62,13 +59,12 @@ class Consensus:
                 DeformationTransfer(source, target, dense),
                 ProportionMatching(source, target, correspondence),
             )
-            self.inside = Inside.of(source, target, correspondence)
 
     def __call__(self, clip: Clip) -> Clip:
         """The clip on the target, weights in [0, 1]."""
         check_names(clip, self.source)
         answers = torch.stack([method(clip).weights for method in self.methods])
         weights = answers.mean(0)
-        if self.inside is not None:
-            weights = self.inside.corrected(clip.weights, weights)
+        if not self.matching.partners:
+            weights = self.matching.inside.corrected(clip.weights, weights)
         return replace(clip, names=self.target.names, weights=weights)

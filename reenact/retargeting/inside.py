@@ -20,7 +20,7 @@ from torch import Tensor
 from reenact.geometry import connected_pieces, farthest_points
 from reenact.retargeting.correspondence import Correspondence, Places
 from reenact.retargeting.inverse_rig import nonnegative_least_squares
-from reenact.retargeting.rbf import ThinPlate
+from reenact.retargeting.rbf import CarriedShapes
 from reenact.rigs.rig import Rig
 
 _REACH = 0.04
@@ -54,29 +54,27 @@ class Inside:
     their_seen: Float[Tensor, "Kt"]
 
     @classmethod
-    def of(cls, source: Rig, target: Rig, correspondence: Correspondence, stiffness: float = 1.0) -> Inside:
+    def of(cls, source: Rig, target: Rig, correspondence: Correspondence, carried: CarriedShapes) -> Inside:
         """
         Args:
             source: The actor.
             target: The rig.
             correspondence: Pairs of places.
-            stiffness: Of the thin-plate map between them.
+            carried: The target in the source's proportions, by these pairs.
         """
         sides = (source, correspondence.source), (target, correspondence.target)
         inner = [_inner_vertices(rig, places) for rig, places in sides]
         seen = [_seen(rig, places, some) for (rig, places), some in zip(sides, inner)]
         if not len(inner[0]) or not len(inner[1]):
             return cls(*(torch.zeros(len(rig.names), 0).double() for rig, _ in sides), *seen)
-        places = correspondence.source.of(source.neutral.double())
-        trust = correspondence.confidence.double().clamp_min(1e-3)
-        plate = ThinPlate(correspondence.target.of(target.neutral.double()), places, stiffness / trust)
+        places = carried.source_neutral
         width = _REACH * float((places - places.mean(0)).square().sum(1).mean().sqrt())
-        (points, motions), (start, moved) = (_motion(rig, some) for rig, some in zip((source, target), inner))
-        placed = plate(start)
+        points, start = source.neutral[inner[0]].double(), target.neutral[inner[1]].double()
+        placed = carried.carry(start)
         probes = torch.cat([each[farthest_points(each, min(_POINTS, len(each)))] for each in (points, placed)])
         return cls(
-            _field(probes, points, motions, width),
-            _field(probes, placed, plate(start + moved) - placed, width),
+            _field(probes, points, source.deltas[:, inner[0]].double(), width),
+            _field(probes, placed, carried.carry(start + target.deltas[:, inner[1]].double()) - placed, width),
             *seen,
         )
 
@@ -138,14 +136,11 @@ def _inner_vertices(rig: Rig, places: Places) -> Int[Tensor, "N"]:
 
 
 def _seen(rig: Rig, places: Places, inner: Int[Tensor, "N"]) -> Float[Tensor, "K"]:
-    at_places, inside = (moved.double().norm(dim=-1) for moved in (places.of(rig.deltas), rig.deltas[:, inner]))
+    """How far each shape moves any place, where 1 is how far it moves any of the inner vertices."""
     if not len(inner):
         return torch.full((len(rig.names),), torch.inf).double()
+    at_places, inside = (moved.double().norm(dim=-1) for moved in (places.of(rig.deltas), rig.deltas[:, inner]))
     return at_places.amax(1) / inside.amax(1).clamp_min(1e-300)
-
-
-def _motion(rig: Rig, vertices: Int[Tensor, "N"]) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "K N 3"]]:
-    return rig.neutral[vertices].double(), rig.deltas[:, vertices].double()
 
 
 def _field(

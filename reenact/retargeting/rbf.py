@@ -14,6 +14,7 @@ dg_k    guess                   (Kt, N, 3) the same in the source's proportions
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -131,6 +132,8 @@ class CarriedShapes:
     """How sure each pair is."""
     scale: float
     """Size of the source in units of the target."""
+    carry: Callable[[Float[Tensor, "*batch 3"]], Float[Tensor, "*batch 3"]]
+    """Where any point of the target lies in the source's proportions."""
 
     def displacements(self, weights: Float[Tensor, "T Ks"]) -> Float[Tensor, "T N 3"]:
         """da: how the source's weights move its places."""
@@ -174,6 +177,7 @@ def carry_shapes(
         guess=guess,
         confidence=confidence,
         scale=float(scale),
+        carry=lambda points: plate(scale * points @ rotation.T + translation),
     )
 
 

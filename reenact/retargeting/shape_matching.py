@@ -146,7 +146,8 @@ class ShapeMatching:
         config = config or ShapeMatchingConfig()
         self.carried = carry_shapes(source, target, correspondence, stiffness=config.stiffness)
         ours, theirs = self.carried.source_shapes, self.carried.guess
-        compared = self._compared(config, correspondence)
+        self.inside = Inside.of(source, target, correspondence, self.carried)
+        compared = self._compared(config)
         sure = find_partners(*compared, replace(config, similarity=config.sure))
         believed = len(sure.single) >= config.share * min(len(source.names), len(target.names))
         self.partners = find_partners(*compared, config, likeness) if believed else Partners()
@@ -167,13 +168,9 @@ class ShapeMatching:
         weights = nonnegative_least_squares(self.gram, projections, high=1.0)
         return replace(clip, names=self.target.names, weights=weights.float())
 
-    def _compared(
-        self, config: ShapeMatchingConfig, correspondence: Correspondence
-    ) -> tuple[Float[Tensor, "Ks D"], Float[Tensor, "Kt D"]]:
-        """Motions of both rigs' shapes as rows, averaged over neighbouring places and weighted by confidence.
-
-        Shapes that move no place are compared inside, see `reenact.retargeting.inside`.
-        """
+    def _compared(self, config: ShapeMatchingConfig) -> tuple[Float[Tensor, "Ks D"], Float[Tensor, "Kt D"]]:
+        """Motions of both rigs' shapes as rows, averaged over neighbouring places and weighted by confidence; inside of
+        shapes that move no place."""
         places = self.carried.source_neutral
         width = config.blur * float((places - places.mean(0)).square().sum(1).mean().sqrt())
         ours, theirs = [], []
@@ -182,7 +179,7 @@ class ShapeMatching:
             near = near / near.sum(1, keepdim=True).clamp_min(1e-12) * trust.sqrt()[:, None]
             ours.append(torch.einsum("nm,kmi->kni", near, self.carried.source_shapes).flatten(1))
             theirs.append(torch.einsum("nm,kmi->kni", near, self.carried.guess).flatten(1))
-        hidden = Inside.of(self.source, self.target, correspondence, config.stiffness).hidden()
+        hidden = self.inside.hidden()
         return torch.cat([*ours, hidden[0]], 1), torch.cat([*theirs, hidden[1]], 1)
 
 
