@@ -208,6 +208,15 @@ def test_samples_are_pairs_of_the_whole_and_all_different(man, to_woman):
     assert set(few.source.corners[:, 0].tolist()) <= set(to_woman.source.corners[:, 0].tolist())
 
 
+def test_the_surest_pair_around_each_place_is_sampled_every_time(man):
+    whole = Correspondence.identity(man, man)[torch.from_numpy(Face.of(man).vertices)]
+    confidence = torch.from_numpy(np.random.default_rng(0).uniform(0.2, 1.0, len(whole))).float()
+    pairs = replace(whole, confidence=confidence)
+    few = pairs.sample(man, 60)
+    assert float(few.confidence.median()) > 0.95  # of dozens around each place
+    assert all(torch.equal(pairs.sample(man, 60).source.corners, few.source.corners) for _ in range(10))
+
+
 def test_pairs_that_do_not_move_cannot_be_sampled(toy_rig):
     back = (toy_rig.neutral[:, 2] < -0.05).nonzero().flatten()[:6]
     pairs = Correspondence(Places.at(back), Places.at(back), torch.ones(6))

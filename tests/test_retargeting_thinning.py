@@ -80,12 +80,11 @@ def test_a_piece_that_is_too_small_to_keep_is_dropped():
 def test_pairs_found_on_thinned_rigs_hold_on_the_whole_ones(monkeypatch):
     man, toon = divided(load_rig("anny:man")), load_rig("anny:toon")
     monkeypatch.setattr(correspondence, "MOST_VERTICES", 7000)
-    pairs = find_correspondence(man, toon, 200)
-    before = len(toon.neutral)
+    pairs = find_correspondence(man, toon, None)
     own = pairs.source.corners[:, 0]
-    known = own < before  # the old vertices have the same numbers on both heads
-    there = pairs.target.of(toon.neutral)[known]
-    miss = (there - toon.neutral[own[known]]).norm(dim=1)
-    height = float(np.ptp(toon.neutral[:, 1].numpy()))
-    assert known.sum() > 20
-    assert float(miss.median()) < 0.015 * height
+    known = own < len(toon.neutral)  # the old vertices have the same numbers on both heads
+    miss = (pairs.target.of(toon.neutral)[known] - toon.neutral[own[known]]).norm(dim=1)
+    miss, confidence = miss / np.ptp(toon.neutral[:, 1].numpy()), pairs.confidence[known]
+    for sure, fewest, bound in ((0.5, 100, 0.006), (0.2, 300, 0.012)):
+        assert int((confidence > sure).sum()) > fewest
+        assert float(miss[confidence > sure].median()) < bound

@@ -111,10 +111,10 @@ class Correspondence:
         spread = farthest_points(points, min(count, moving), weights)
         eligible = weights.nonzero().flatten()
         cell = torch.cdist(points[eligible], points[spread]).argmin(1)
-        order = self.confidence[eligible].argsort(stable=True)  # so that the surest of each cell is written last
-        surest = spread.clone()
-        surest[cell[order]] = eligible[order]
-        return self[surest]
+        order = self.confidence[eligible].argsort(stable=True)
+        surest = spread.numpy().copy()
+        surest[cell[order].numpy()] = eligible[order].numpy()  # NumPy keeps what is written last; PyTorch any of them
+        return self[torch.from_numpy(surest)]
 
     def reversed(self) -> Correspondence:
         """The same pairs from the target to the source."""
