@@ -287,8 +287,7 @@ def true_weights(
         and the indices of the target's shapes that the truth covers, none where the rigs share no name.
     """
     full_source, source_matrix = _unmerged(source)
-    full_target = target if matching(full_source.names, target.names).any() else _in_arkit(target)
-    full_target = full_target if full_target is not target else _unmerged(target)[0]
+    full_target = _told_by(full_source, target)
     shared = matching(full_source.names, full_target.names)
     there = shared.any(0).nonzero().flatten().tolist()
     known = weights.clone()
@@ -297,6 +296,30 @@ def true_weights(
     if full_target is target:
         return known, truth.clamp(0, 1), there
     return known, _fit(full_target, truth, target), list(range(len(target.names))) if there else []
+
+
+def true_return(source: Rig, target: Rig, truth: Float[Tensor, "T Kt"]) -> Float[Tensor, "T Ks"]:
+    """The source's weights that come back where the target shows the truth and both ways are exact.
+
+    What they lack is what the target cannot show: cyclic numbers of a faithful method end about there. Ours.
+
+    Args:
+        source: Where motion came from, and comes back to.
+        target: Between both, of names that `true_weights` knows.
+        truth: What `true_weights` asks of the target.
+    """
+    full_source = _unmerged(source)[0]
+    full_target = _told_by(full_source, target)
+    shown = truth if full_target is target else _fit(target, truth, full_target)
+    back = shown @ matching(full_target.names, full_source.names)
+    return back if full_source is source else _fit(full_source, back, source)
+
+
+def _told_by(source: Rig, target: Rig) -> Rig:
+    """The target's head with the shapes that the source's names tell of; the target itself where its own are those."""
+    if not matching(source.names, target.names).any():
+        return _in_arkit(target)
+    return _unmerged(target)[0]
 
 
 def _in_arkit(rig: Rig) -> Rig:

@@ -44,6 +44,7 @@ from reenact.evaluation import (
     skill,
     speed,
     true_numbers,
+    true_return,
     true_weights,
     vertex_error_ratio,
     weight_metrics,
@@ -363,6 +364,11 @@ def recovered_numbers(
         "wmae": float((recovered - original).abs().mean()),
         "ver": vertex_error_ratio(rig, recovered, original),
     }
+
+
+def best_return(trial: Trial) -> dict[str, float]:
+    """The cyclic numbers of the truth itself, see `true_return`: about what a faithful method can reach at most."""
+    return recovered_numbers(trial.source, true_return(trial.source, trial.target, trial.truth), _weights(trial))
 
 
 def _single_shapes(forward: Retargeter, trial: Trial) -> dict[str, float]:
