@@ -27,8 +27,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from reenact.evaluation import held_out_clips, moving_vertices, true_weights
+from reenact.evaluation import held_out_clips
 from reenact.geometry import rigid_fit
+from reenact.metrics import moving_vertices
 from reenact.retargeting.anacondar import Anacondar, AnacondarConfig
 from reenact.retargeting.anatomical_transfer import AnatomicalTransfer
 from reenact.retargeting.anatomy import JAW, build_shell
@@ -40,6 +41,7 @@ from reenact.retargeting.inverse_rig import InverseRig
 from reenact.retargeting.plbs import PatchConfig, PatchwiseBlendshapes
 from reenact.rigs import motion
 from reenact.rigs.files import load_rig
+from reenact.truth import true_weights
 
 ICT = Path(__file__).parents[2] / "shared" / "rigs" / "ict_face.glb"
 """A head of another maker and topology, where it is present."""

@@ -21,8 +21,8 @@ import torch
 
 from reenact.config import BPNetConfig, Config, ImageConfig, ReenactNetConfig, TrainingConfig
 from reenact.errors import ReenactError
-from reenact.evaluation import vertex_error_ratio
 from reenact.inference import ImageRetargeter
+from reenact.metrics import vertex_error_ratio
 from reenact.suite import Trial
 from reenact.training import train
 

@@ -27,8 +27,9 @@ import torch
 from reenact.config import Config, load_config
 from reenact.data import check_device
 from reenact.errors import ReenactError
-from reenact.evaluation import speed, vertex_error_ratio
+from reenact.evaluation import speed
 from reenact.inference import ImageRetargeter
+from reenact.metrics import vertex_error_ratio
 from reenact.portrait import Portrait
 from reenact.rigs import motion
 from reenact.rigs.files import load_rig

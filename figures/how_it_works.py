@@ -25,11 +25,11 @@ import matplotlib.pyplot as plt
 import torch
 from torch import Tensor
 
-from reenact.evaluation import true_weights
 from reenact.inference import ImageRetargeter
 from reenact.portrait import Portrait
 from reenact.rigs import arkit
 from reenact.rigs.rig import Rig
+from reenact.truth import true_weights
 
 POSES = (
     {"jawOpen": 0.6, "mouthSmileLeft": 0.7, "mouthSmileRight": 0.7, "browInnerUp": 0.7},

@@ -29,8 +29,8 @@ from torch import Tensor
 
 from reenact.atomic import write_atomically
 from reenact.config import Config, ImageConfig, LayoutConfig, PairsConfig, TrainingConfig
-from reenact.evaluation import per_shape
 from reenact.inference import ImageRetargeter
+from reenact.metrics import per_shape
 from reenact.preview import save_contact_sheet
 from reenact.rigs.files import load_rig, save_rig
 from reenact.suite import Trial, measure

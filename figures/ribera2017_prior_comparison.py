@@ -40,8 +40,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from reenact.evaluation import vertex_error_ratio
 from reenact.geometry import farthest_points
+from reenact.metrics import vertex_error_ratio
 from reenact.portrait import Portrait
 from reenact.retargeting.correspondence import Correspondence
 from reenact.retargeting.geometric_prior import FrameSolver, bending, sparsity_thresholds

@@ -30,13 +30,15 @@ from torch import Tensor
 
 from reenact.atomic import write_atomically
 from reenact.errors import ReenactError
-from reenact.evaluation import KINDS, PictureRetargeter, finite, true_weights, vertex_errors
+from reenact.evaluation import KINDS, PictureRetargeter, finite
 from reenact.holdout import NUMBER
+from reenact.metrics import vertex_errors
 from reenact.portrait import Portrait
 from reenact.rigs import arkit
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
 from reenact.training import parsed_line
+from reenact.truth import true_weights
 
 PLAYER_FRAMES = 96
 """Frames in the player, shared by the runs of a page."""

@@ -31,10 +31,8 @@ from torch import Tensor
 
 from reenact.config import Config, changed_settings
 from reenact.errors import ReenactError
-from reenact.evaluation import (
-    contacts_of,
-    finite,
-    held_out_clips,
+from reenact.evaluation import contacts_of, finite, held_out_clips, speed, true_numbers
+from reenact.metrics import (
     image_mae,
     image_ssim,
     jitter,
@@ -42,10 +40,6 @@ from reenact.evaluation import (
     moving_vertices,
     psnr_of,
     skill,
-    speed,
-    true_numbers,
-    true_return,
-    true_weights,
     vertex_error_ratio,
     weight_metrics,
 )
@@ -56,6 +50,7 @@ from reenact.rigs import arkit
 from reenact.rigs.clip import Clip
 from reenact.rigs.files import load_clip, load_rig
 from reenact.rigs.rig import Rig
+from reenact.truth import true_return, true_weights
 
 TARGETS = ("anny:woman", "anny:child", "anny:toon", "anny:merged", "anny:units")
 """Whom `anny:man` is retargeted to."""

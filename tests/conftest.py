@@ -146,3 +146,22 @@ def chromium():
         )
         yield browser
         browser.close()
+
+
+CLOUD_NAMES = (
+    "jawOpen",
+    "eyeBlinkLeft",
+    "eyeBlinkRight",
+    "mouthSmileLeft",
+    "mouthSmileRight",
+    "browInnerUp",
+    "cheekPuff",
+)
+
+
+def make_cloud_rig(name: str, names: tuple[str, ...] = CLOUD_NAMES, seed: int = 0) -> Rig:
+    """Forty vertices in a box, which every shape moves at random."""
+    generator = torch.Generator().manual_seed(seed)
+    vertices = torch.rand(40, 3, generator=generator)
+    deltas = 0.1 * torch.randn(len(names), 40, 3, generator=generator)
+    return Rig(name, vertices, deltas, names, torch.randint(0, 40, (60, 3), generator=generator))

@@ -13,8 +13,8 @@ from reenact.cli import main
 from reenact.config import Config, PairsConfig, check_config, load_config, save_config
 from reenact.data import Studio
 from reenact.errors import ReenactError
-from reenact.evaluation import vertex_error_ratio
 from reenact.inference import ImageRetargeter
+from reenact.metrics import vertex_error_ratio
 from reenact.retargeting import correspondence as correspondences
 from reenact.retargeting.correspondence import Correspondence, Places
 from reenact.rigs.clip import Clip

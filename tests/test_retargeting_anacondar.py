@@ -7,7 +7,8 @@ import torch
 from conftest import make_toy_rig
 
 from reenact.errors import ReenactError
-from reenact.evaluation import held_out_clips, moving_vertices
+from reenact.evaluation import held_out_clips
+from reenact.metrics import moving_vertices
 from reenact.retargeting import METHODS
 from reenact.retargeting.anacondar import Anacondar, AnacondarConfig
 from reenact.retargeting.anatomy import build_shell, default_thickness

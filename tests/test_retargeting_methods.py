@@ -7,8 +7,8 @@ import torch
 from conftest import make_toy_rig
 
 from reenact.errors import ReenactError
-from reenact.evaluation import vertex_error_ratio
 from reenact.geometry import farthest_points
+from reenact.metrics import vertex_error_ratio
 from reenact.retargeting import METHODS
 from reenact.retargeting.capture import drive, load_places
 from reenact.retargeting.correspondence import Correspondence, Places

@@ -7,11 +7,9 @@ import torch
 
 from reenact import suite
 from reenact.errors import ReenactError
-from reenact.evaluation import true_return, true_weights, vertex_error_ratio
+from reenact.metrics import vertex_error_ratio
 from reenact.retargeting.correspondence import Correspondence
-from reenact.rigs import anny
 from reenact.rigs.files import load_rig
-from reenact.rigs.matching import matching
 from reenact.suite import Cell, Trial, append_cell, best_return, load_cells, region_vertices, run_suite, table, versions
 
 
@@ -30,37 +28,12 @@ def test_regions_are_where_lips_lids_and_brows_are(man):
         assert inside > 0.8, part
 
 
-def test_a_rig_of_other_shapes_has_the_truth_of_its_own_head_with_arkit_shapes(man):
-    units = load_rig("anny:units")
-    assert not matching(man.names, units.names).any()
-    weights = torch.zeros(1, 52)
-    weights[0, man.names.index("jawOpen")] = 1
-    known, truth, shared = true_weights(man, units, weights)
-    assert torch.equal(known, weights)
-    assert shared == list(range(34))
-    head = anny.with_arkit_shapes("anny:units")
-    assert torch.equal(head.neutral, units.neutral)
-    wanted = head.vertices(weights) - head.neutral
-    missed = units.vertices(truth) - units.neutral - wanted
-    assert missed.norm() < 0.6 * wanted.norm()  # 34 other shapes come half as near
-
-
 def test_the_truth_comes_back_whole_from_the_same_shapes_and_in_part_from_others(man):
     same, other = (best_return(Trial.of(man, load_rig(name), 36, 0)) for name in ("anny:woman", "anny:units"))
     assert same["mae"] == 0
     assert same["skill"] == 1
     assert 0.1 < other["skill"] < 0.8
     assert other["ver"] < 0.8
-
-
-def test_what_a_merged_head_can_show_comes_back_exactly(man):
-    merged = load_rig("anny:merged")
-    shown = torch.rand(6, len(merged.names), generator=torch.Generator().manual_seed(0)) * 0.4
-    weights = shown @ anny.merged_matrix()[2].T
-    known, truth, _ = true_weights(man, merged, weights)
-    torch.testing.assert_close(known, weights)
-    torch.testing.assert_close(true_return(man, merged, truth), weights, atol=1e-3, rtol=0)
-    assert vertex_error_ratio(merged, true_return(merged, man, weights), shown) < 1e-3  # other weights may say the same
 
 
 def test_methods_are_measured_on_every_pair_and_a_failure_is_a_row(monkeypatch):

@@ -18,8 +18,8 @@ from rich.console import Console
 from reenact.checkpoint import load_checkpoint
 from reenact.config import BPNetConfig, PairsConfig, load_config, save_config
 from reenact.errors import ReenactError
-from reenact.evaluation import vertex_error_ratio
 from reenact.inference import ImageRetargeter
+from reenact.metrics import vertex_error_ratio
 from reenact.nudges import Nudge, Nudges, save_nudges
 from reenact.pairs import Pairs, Teacher
 from reenact.rigs.clip import Clip

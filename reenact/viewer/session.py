@@ -354,7 +354,7 @@ class Session:
 
     def _true(self, target: Rig, weights: Tensor) -> Tensor | None:
         """What the target should do as far as names tell; None where they tell nothing."""
-        from reenact.evaluation import true_weights
+        from reenact.truth import true_weights
 
         _, truth, shapes = true_weights(self.rigs[self.source], target, weights)
         return truth if shapes else None
