@@ -47,7 +47,7 @@ from reenact.retargeting.retargeter import Retargeter
 from reenact.rigs import motion
 from reenact.rigs.clip import Clip
 from reenact.rigs.rig import Rig
-from reenact.truth import true_weights
+from reenact.truth import true_return, true_weights
 
 KINDS = motion.KINDS
 """Kinds of held-out clips. Each probes something else: a method can shine on speech and miss every blink."""
@@ -211,6 +211,8 @@ def evaluate_retargeters(
           earns its place by beating it.
         - `paired`: the pairs of shapes that training found, applied to the weights without any network; None without
           pairs. Zero where every shape of one rig has its partner on the other: read `truth` beside it.
+        - `exact`: the truth itself, and what comes back of it (`true_return`): what the target cannot show is lost to
+          any method, so `cyclic` is to be read beside this one's. None where the truth is.
         - `methods`: the `truth` of each of `methods`, None without one.
         - `kinds`: `truth` and `cyclic` per kind of clip. `shapes`: `per_shape` by name. `worst`: frames by falling
           vertex error.
@@ -236,6 +238,7 @@ def evaluate_retargeters(
     direct_back = _in_chunks(lambda part: reverse.read_direct(reverse.source_pictures(part)), direct)
     paired = forward.paired(weights)
     order = torch.randperm(len(weights), generator=torch.Generator().manual_seed(seed))
+    known, truth, covered = true_weights(source, target, weights)
 
     say("comparing pictures of the cycle")
     returned = {
@@ -246,6 +249,8 @@ def evaluate_retargeters(
     }
     if paired is not None:
         returned["paired"] = reverse.paired(paired)
+    if covered:
+        returned["exact"] = true_return(source, target, truth)
     cycle.against(returned).against_pictures("shuffled", cycle.pictures[order])
     returned["shuffled"] = weights[order]
     cyclic = {
@@ -256,7 +261,6 @@ def evaluate_retargeters(
     say("comparing methods")
     moved = {f"method {name}": _retarget(method, clips) for name, method in (methods or {}).items()}
     say("comparing with the truth")
-    known, truth, covered = true_weights(source, target, weights)
     true: dict[str, dict[str, Any]] = {}
     decoded, shapes, worst = None, [], []
     arrays: dict[str, np.ndarray] = {}
@@ -275,6 +279,7 @@ def evaluate_retargeters(
             "neutral": torch.zeros_like(truth),
             "mean_pose": truth.mean(0).expand_as(truth),
             "shuffled": truth[order],
+            "exact": truth,
         }
         contacts = contacts_of(target)
         true = {
@@ -324,6 +329,7 @@ def evaluate_retargeters(
         "baselines": {name: summary(name, "all") for name in ("neutral", "mean_pose", "shuffled")},
         "direct": summary("direct", "all"),
         "paired": None if paired is None else summary("paired", "all"),
+        "exact": summary("exact", "all") if covered else None,
         "methods": {name: {"truth": true[f"method {name}"]["all"] if true else None} for name in methods or {}},
         "kinds": {kind: summary("reenact", kind) for kind in kinds},
         "shapes": shapes,

@@ -284,6 +284,7 @@ def _methods(result: dict[str, Any]) -> list[dict[str, Any]]:
         *([("the labels that taught it, no network", result["paired"])] if result.get("paired") else []),
         *((f"{name}, no network", {"cyclic": {}, **numbers}) for name, numbers in result.get("methods", {}).items()),
         *((_BASELINES[name], result["baselines"][name]) for name in _BASELINES),
+        *([("the truth, and what comes back of it", result["exact"])] if result.get("exact") else []),
     ]
     return [{"title": title, "width": _width(row["truth"]), **row} for title, row in rows]
 

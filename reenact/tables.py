@@ -67,6 +67,8 @@ def evaluation_tables(numbers: dict[str, Any]) -> list[Table]:
     run = f"{numbers['run']}{of_step(numbers.get('checkpoint'))}"
     title = f"{run}: {numbers['source']} -> {numbers['target']}, {numbers['frames']} unseen frames"
     caption = "direct: without ReenactNet" + "; pairs: of shapes, without any network" * bool(numbers["paired"])
+    if numbers.get("exact"):
+        caption += f"\ncyclic.skill of the truth itself: {_number(numbers['exact']['cyclic']['skill'])}"
     look: dict[str, Any] = {"title_justify": "left", "box": SIMPLE_HEAD, "pad_edge": False}  # 80 columns hold them
     compared = Table(title=title, caption=caption, caption_justify="left", **look)
     compared.add_column("", no_wrap=True)

@@ -104,6 +104,7 @@ def test_a_perfect_copy_gets_perfect_numbers(perfect):
     assert numbers["truth"]["ver"] == 0
     assert numbers["truth"]["gain"] == pytest.approx(1)
     assert numbers["truth"]["correlation"] == pytest.approx(1)
+    assert numbers["exact"]["cyclic"]["skill"] == 1
     assert numbers["bpnet"]["ver"] < 1e-4  # pictures are read back through a pseudo-inverse in float32
     assert numbers["decoded"]["mae"] < 1e-4  # the same
     assert all(numbers["kinds"][kind]["truth"]["ver"] == 0 for kind in evaluation.KINDS)
@@ -164,6 +165,12 @@ def test_shapes_without_a_partner_stay_at_rest_in_the_truth():
     assert arrays["truth_source"][:, -1].max() == 0
     assert arrays["truth"][:, -1].max() == 0
     assert numbers["truth"]["ver"] == 0
+    assert numbers["exact"]["truth"]["ver"] == 0
+    returned = torch.from_numpy(arrays["source"]).clone()
+    returned[:, -1] = 0  # the target cannot show it
+    lost = metrics.vertex_error_ratio(source, returned, torch.from_numpy(arrays["source"]))
+    assert numbers["exact"]["cyclic"]["ver"] == pytest.approx(lost)
+    assert lost > 0.05
 
 
 def test_rigs_without_a_shared_name_have_no_truth_but_a_cycle():
@@ -172,6 +179,7 @@ def test_rigs_without_a_shared_name_have_no_truth_but_a_cycle():
     )
     assert numbers["truth"] is None
     assert numbers["decoded"] is None
+    assert numbers["exact"] is None
     assert numbers["baselines"]["neutral"]["truth"] is None
     assert numbers["cyclic"]["mae"] == 0
     assert "truth" not in arrays

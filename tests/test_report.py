@@ -151,7 +151,15 @@ def test_names_from_files_are_text_never_markup(page):
 def test_the_page_shows_the_numbers_beside_the_baselines(page, run):
     truth = run[2]["truth"]
     assert truth["ver"] == pytest.approx(0.5, rel=1e-5)
-    for words in ("this run", "without ReenactNet", "neutral, never moves", "mean pose", "shuffled truth", "blinks"):
+    for words in (
+        "this run",
+        "without ReenactNet",
+        "neutral, never moves",
+        "mean pose",
+        "shuffled truth",
+        "what comes back",
+        "blinks",
+    ):
         assert words in page
     assert ">0.50</td>" in page
 
