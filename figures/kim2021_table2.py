@@ -34,7 +34,9 @@ PAPER = {"Mery": (0.016, 0.895), "Polywink": (0.016, 0.892), "Man A": (0.016, 0.
 PAPER |= {"Man C": (0.017, 0.886)}
 """MAE and SSIM of Victor to each and back."""
 FRAMES = 600
+"""Held out, of each cell."""
 TRUTH = "cyclic.skill of the truth"
+"""The last column, see `reenact.truth.true_return`."""
 COLUMNS = ("cyclic.mae", "cyclic.ssim", "cyclic.skill", "cyclic.mae_masked", "cyclic.skill_masked", "ver")
 
 

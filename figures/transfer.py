@@ -50,13 +50,17 @@ SHORT = (
     "cyclic at 128 pixels: MAE, SSIM",
     "cyclic skill",
 )
-"""The rows of README.md."""
-
-CEILING = "cyclic skill of the truth"
+"""The rows that README.md has of these; that of delta transfer is from results/geometric.jsonl, see docs/methods.md."""
 
 
 def shown(cells: Sequence[Cell], kind: str, alone: bool) -> str:
-    """Mean of one number over seeds; with its spread where it stands alone and there are several."""
+    """Mean of one number over seeds; with its standard deviation where it stands alone and there are several.
+
+    Args:
+        cells: One for each seed.
+        kind: Name and format, as in `ROWS`.
+        alone: Whether the row has no other numbers.
+    """
     stars = "**" if kind.startswith("**") else ""
     name, _, how = kind.strip("*").partition(":")
     values = [cell.seconds if name == "seconds" else number(cell, name) for cell in cells]
@@ -104,7 +108,7 @@ def main() -> None:
         print(f"| {title} | {' | '.join(row)} |")
         if title == "cyclic skill":
             row = [ceiling(each, options.frames, files) for each in columns.values()]
-            print(f"| {CEILING} | {' | '.join(row)} |", flush=True)
+            print(f"| cyclic skill of the truth | {' | '.join(row)} |", flush=True)
     print(f"\n{versions(cells)}")
 
 

@@ -46,7 +46,7 @@ def true_weights(
 def true_return(source: Rig, target: Rig, truth: Float[Tensor, "T Kt"]) -> Float[Tensor, "T Ks"]:
     """The source's weights that come back where the target shows the truth and both ways are exact.
 
-    What they lack is what the target cannot show: cyclic numbers of a faithful method end about there. Ours.
+    What they lack is what the target cannot show: cyclic numbers of a faithful method end about there. In [0, 1]. Ours.
 
     Args:
         source: Where motion came from, and comes back to.
